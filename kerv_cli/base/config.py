@@ -90,13 +90,17 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     typed = _typed(overrides, schema)
     if typed.get("quick"):
         typed = read_yaml_lines(conf_dir() / "quick.yaml", "quick=true")[0].get(command, {}) | typed
-    defaults = choices_of(schema)
-    chosen = {key: str(value) for key, value in typed.items() if key in defaults}
-    preset = next((group for group in PRESETS if group in defaults), "")
-    choices, values, places = _read_preset(preset, chosen.pop(preset, defaults.pop(preset, "")))
-    choices = defaults | choices | chosen
-    values += [(key, value) for key, value in typed.items() if key not in choices_of(schema)]
-    places = {key: place for key, place in places.items() if key not in typed}
+    choices, known = choices_of(schema), choices_of(schema)
+    preset = next((group for group in PRESETS if group in choices), "")
+    parts_of_file, values, lines = _read_preset(preset, str(typed.get(preset, choices.pop(preset, ""))))
+    choices |= parts_of_file
+    for key, value in typed.items():
+        lines.pop(key, None)
+        if key in known:
+            choices[key] = str(value)
+        else:
+            values.append((key, value))
+    choices.pop(preset, None)
     key = ""
     try:
         nodes = copy.deepcopy(_composed((*choices.items(),), schema, conf_dir(), (*parts("artifact"),)))  # type: ignore[arg-type]
@@ -107,19 +111,19 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
         key, settings = "", cast(T, OmegaConf.to_object(nodes))
         _check(settings)
     except UsageError as error:
-        if error.key not in places:
+        if error.key not in lines:
             raise
-        raise UsageError(f"{places[error.key]}{error}", error.key) from error
+        raise UsageError(f"{lines[error.key]}{error}", error.key) from error
     except (ConfigAttributeError, ConfigKeyError) as error:
         key = key if key in typed else str(error.full_key)
         hint = did_you_mean(key, _keys(nodes)) or f"see 'kerv {command.replace('_', ' ')} --cfg' for the keys"
-        raise UsageError(f"{places.get(key, '')}unknown key '{key}': {hint}", key) from error
+        raise UsageError(f"{lines.get(key, '')}unknown key '{key}': {hint}", key) from error
     except (OmegaConfBaseException, ValueError, TypeError, RecursionError) as error:
         key = getattr(error, "full_key", None) or key
         message = str(error).partition("\n")[0]
         if isinstance(error, ValidationError) and (at := _field(nodes, key)) is not None:
             message += f" {range_of(at)}".rstrip()
-        raise UsageError(f"{places.get(key, '')}{f'{key}: ' if key else ''}{message}", key) from error
+        raise UsageError(f"{lines.get(key, '')}{f'{key}: ' if key else ''}{message}", key) from error
     return settings
 
 
@@ -178,17 +182,19 @@ def _read_preset(group: str, name: str) -> tuple[dict[str, str], list[tuple[str,
     """
     if not group:
         return {}, [], {}
-    path = preset_file(group, name)
-    content, lines = read_yaml_lines(path, f"{group}={path}")
-    if group == "study":
-        values = [(f"study.{key}", value) for key, value in content.items()]
-        return {}, values, {f"study.{key}": f"{path}:{line}: " for key, line in lines.items()}
-    places = {key: f"{path}:{line}: " for key, line in lines.items()}
-    if "defaults" in content:
-        raise UsageError(f"{places['defaults']}a method's file has no defaults: write PART: NAME, as proposer: drafter")
-    choices = {key: value for key, value in content.items() if key in SETTINGS_GROUPS and isinstance(value, str)}
-    values = [(key, value) for key, value in content.items() if key not in choices]
-    return choices, [*values, ("method", path.stem)], places
+    path, prefix = preset_file(group, name), "study." if group == "study" else ""
+    content, numbers = read_yaml_lines(path, f"{group}={path}")
+    lines = {f"{prefix}{key}": f"{path}:{number}: " for key, number in numbers.items()}
+    if "defaults" in content and not prefix:
+        raise UsageError(f"{lines['defaults']}a method's file has no defaults: write PART: NAME, as proposer: drafter")
+    choices: dict[str, str] = {}
+    values: list[tuple[str, Any]] = []
+    for key, value in content.items():
+        if not prefix and key in SETTINGS_GROUPS and isinstance(value, str):
+            choices[key] = value
+        else:
+            values.append((f"{prefix}{key}", value))
+    return choices, values if prefix else [*values, ("method", path.stem)], lines
 
 
 def _check(settings: Any) -> None:
@@ -269,7 +275,9 @@ def _choice(group: str, name: str) -> tuple[Part | None, list[tuple[str, Any]]]:
     base = content.pop("base", None)
     part, values = (parts_of_group.get(name), []) if base is None else _choice(group, base)
     prefix = "" if group in WHOLE else f"{group}."
-    return part, [*values, *((f"{prefix}{key}", value) for key, value in content.items())]
+    for key, value in content.items():
+        values.append((f"{prefix}{key}", value))
+    return part, values
 
 
 def _open_mappings(node: Any) -> None:

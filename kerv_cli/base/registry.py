@@ -416,10 +416,10 @@ def load_plugins() -> None:
             importlib.import_module(name)
         except Exception as error:
             what = error if isinstance(error, KervError) else f"{type(error).__name__}: {getattr(error, 'msg', error)}"
-            raise UsageError(f"plugin {name}: {_place_of(error)}{what}; or leave it out of {PLUGINS}") from error
+            raise UsageError(f"plugin {name}: {_line_of(error)}{what}; or leave it out of {PLUGINS}") from error
 
 
-def _place_of(error: Exception) -> str:
+def _line_of(error: Exception) -> str:
     """Return where a plugin raised an error, as `FILE:LINE: `. Empty if the plugin was not found."""
     if isinstance(error, SyntaxError):
         return f"{error.filename}:{error.lineno}: "

@@ -64,7 +64,7 @@ def _project(settings: BenchSettings, as_json: bool) -> None:
 def _write(settings: BenchSettings, name: str, document: dict[str, Any]) -> None:
     """Write a result as JSON (docs/formats.md), and print its path."""
     from kerv_cli.base.files import write_json
-    from kerv_cli.base.places import results_dir
+    from kerv_cli.base.paths import results_dir
 
     path = results_dir(settings.results) / "bench" / f"{name}.json"
     write_json(path, document)

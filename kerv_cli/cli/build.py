@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.places import artifact
+from kerv_cli.base.paths import artifact
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, print_figures
 from kerv_cli.cli.making import as_planned

@@ -26,7 +26,7 @@ from typer.core import TyperCommand
 
 from kerv_cli.base.config import compose, groups, plain_text
 from kerv_cli.base.errors import UnknownName, UsageError
-from kerv_cli.base.places import check_writable
+from kerv_cli.base.paths import check_writable
 from kerv_cli.base.registry import NoSettings, Part
 from kerv_cli.base.settings import CommandSettings, choices_of
 from kerv_cli.cli.common import settings_yaml

@@ -13,7 +13,7 @@ import typer
 from kerv_cli.base.errors import UnknownName
 from kerv_cli.base.files import visible
 from kerv_cli.base.limits import number, setting
-from kerv_cli.base.places import check_writable, results_dir
+from kerv_cli.base.paths import check_writable, results_dir
 from kerv_cli.base.settings import RunSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, end_with_json, print_table

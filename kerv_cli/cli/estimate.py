@@ -94,7 +94,7 @@ def _print_tables(policy: Described | None, title: str, estimates: Sequence[Esti
 
 def _trace(settings: EstimateSettings, as_json: bool) -> None:
     """Price a trace on each machine, or say which length of chains would have been the fastest there."""
-    from kerv_cli.base.places import as_path
+    from kerv_cli.base.paths import as_path
     from kerv_cli.bench.described import described
     from kerv_cli.bench.tables import trace_row
     from kerv_cli.bench.traced import CANNOT, choose_length, price

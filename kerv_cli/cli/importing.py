@@ -8,7 +8,7 @@ import typer
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import setting
-from kerv_cli.base.places import as_path
+from kerv_cli.base.paths import as_path
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, console, end_with_json

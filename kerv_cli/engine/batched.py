@@ -74,13 +74,16 @@ class BatchDecoder:
 
     def _tokens(self, chunks: Sequence[Chunk]) -> list[list[int]]:
         """Decode N tokens per chunk greedily. Chunks with equally long prompts are decoded together, unpadded."""
-        tokens: dict[int, list[int]] = {}
-        for length in dict.fromkeys(chunk.target.prompt_length for chunk in chunks):
-            group = [i for i, chunk in enumerate(chunks) if chunk.target.prompt_length == length]
+        groups: dict[int, list[int]] = {}
+        for i, chunk in enumerate(chunks):
+            groups.setdefault(chunk.target.prompt_length, []).append(i)
+        tokens: list[list[int]] = [[]] * len(chunks)
+        for group in groups.values():
             prompt = torch.cat([chunks[i].target.prompt for i in group])
             decoded, _ = greedy(self.target, prompt, self._cache(len(group)), self._size)
-            tokens |= zip(group, decoded.tolist(), strict=True)
-        return [tokens[i] for i in range(len(chunks))]
+            for i, row in zip(group, decoded.tolist(), strict=True):
+                tokens[i] = row
+        return tokens
 
     @property
     def _size(self) -> int:

@@ -103,10 +103,9 @@ def read_profile(path: Path) -> Profile:
     document = read_json(path)
     try:
         stored = document["profile"]
-        phases = {
-            kind: (tuple(map(int, costs["rows"])), tuple(map(float, costs["seconds"])))
-            for kind, costs in stored["phases"].items()
-        }
+        phases: dict[str, tuple[tuple[int, ...], tuple[float, ...]]] = {}
+        for kind, costs in stored["phases"].items():
+            phases[kind] = tuple(map(int, costs["rows"])), tuple(map(float, costs["seconds"]))
         about = {key: value for key, value in document.items() if isinstance(value, str | bool | int | float)}
         profile = Profile(int(stored["prompt"]), phases, int(stored["tokens"]), about)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -199,8 +198,9 @@ def work_of(
         DRAFTING: calls(drafts & ~trees, nodes),
         "tree": calls(trees, np.minimum(levels, size - start - 1)),
     }
-    sources = {kind: np.bincount(decode, np.isin(proposer, names), decodes) > 0 for kind, names in costs.items()}
+    sources: dict[str, np.ndarray] = {}
     for kind, names in costs.items():
+        sources[kind] = np.bincount(decode, np.isin(proposer, names), decodes) > 0
         if any(ProposerPart.find(name).looks_up for name in names):
             sources[kind] |= looked_up
     return Work(

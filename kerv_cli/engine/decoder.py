@@ -290,7 +290,7 @@ class Decoder(ActionDecoder):
             x = x if uncached or not len(draft) else torch.cat([chunk.target.prompt, x], 1)
             hidden = target.forward(x, positions, cache, seen)
             predicted = target.head(hidden[0, before - 1 :]).argmax(-1)
-        # the only place in a round where the CPU waits for the GPU
+        # nowhere else in a round does the CPU wait for the GPU
         targets, *remote = read(predicted, *draft.remote)
         tree = draft.judged(remote)
         return Verified(hidden, tree, targets.astype(np.int64).tolist(), draft.levels or tree.levels)
@@ -346,7 +346,7 @@ class Decoder(ActionDecoder):
         """
         cache, hidden = chunk.target.cache, verified.hidden
         end, before = cache.length - len(verified.tree), hidden.shape[1] - len(verified.tree)
-        if rows == list(range(len(rows))):  # the first nodes of a chain are already in their places
+        if rows == list(range(len(rows))):  # the first nodes of a chain are already in their slots
             cache.length = end + len(rows)
             return hidden[:, : before + len(rows)]
         kept = upload(rows, hidden.device)

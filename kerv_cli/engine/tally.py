@@ -1,4 +1,4 @@
-"""Count how many draft tokens the target accepted, by their place (docs/methods.md §7).
+"""Count how many draft tokens the target accepted, by their position (docs/methods.md §7).
 
 A token is *reached* if the target accepted all tokens before it in its draft.
 """
@@ -46,8 +46,8 @@ class Tally:
             nodes: (n,) number of verified draft tokens.
             dofs: Number of DoFs D.
         """
-        place = np.arange(judged.sum()) - np.repeat(np.cumsum(judged) - judged, judged)
-        dof, taken = (np.repeat(start, judged) + place) % dofs, place < np.repeat(accepted, judged)
+        position = np.arange(judged.sum()) - np.repeat(np.cumsum(judged) - judged, judged)
+        dof, taken = (np.repeat(start, judged) + position) % dofs, position < np.repeat(accepted, judged)
         counts = (np.bincount(accepted), np.bincount(judged), np.bincount(dof, minlength=dofs))
         return cls(int(nodes.sum()), *counts, np.bincount(dof[taken], minlength=dofs))
 
@@ -96,10 +96,10 @@ class Tally:
 
 
 def rates(reached: np.ndarray, accepted: np.ndarray) -> list[float | None]:
-    """Return accepted ÷ reached of each place. None for a place that no draft reached."""
+    """Return accepted ÷ reached at each position. None for a position that no draft reached."""
     quotients: list[float | None] = (accepted / np.maximum(reached, 1)).tolist()
-    for place in np.flatnonzero(reached == 0):
-        quotients[place] = None
+    for position in np.flatnonzero(reached == 0):
+        quotients[position] = None
     return quotients
 
 

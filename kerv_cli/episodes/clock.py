@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import sha256_of
-from kerv_cli.base.places import results_dir
+from kerv_cli.base.paths import results_dir
 from kerv_cli.base.registry import DRAFTING
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.cost import Profile, prices, read_profile, work_of_record

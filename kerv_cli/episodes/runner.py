@@ -115,7 +115,7 @@ def run_together(
 ) -> Iterator[EpisodeEnd[K]]:
     """Run several episodes at once. Yield each request when its episode ends, with the record or the error.
 
-    The batch has up to `batch` places. Each place runs one episode after another. A place opens a world when an episode
+    The batch has up to `batch` slots. Each slot runs one episode after another. A slot opens a world when an episode
     needs one, and keeps it while the task has episodes left, because opening a world takes longer than resetting one.
 
     Args:
@@ -127,25 +127,25 @@ def run_together(
     waiting = list(requests)
     ended: list[EpisodeEnd[K]] = []
     states = [decoder.new_episode() for _ in range(min(batch, len(waiting)))]
-    places = [_one_after_another(state, waiting, ended, open_world) for state in states]
-    decodes: dict[int, Any] = dict.fromkeys(range(len(places)))  # None starts a place's first episode
+    slots = [_one_after_another(state, waiting, ended, open_world) for state in states]
+    decodes: dict[int, Any] = dict.fromkeys(range(len(slots)))  # None starts a slot's first episode
     try:
         while decodes:
             observations: dict[int, Observation] = {}
-            for place, decode in decodes.items():
+            for slot, decode in decodes.items():
                 with contextlib.suppress(StopIteration):
-                    observations[place] = places[place].send(decode)
+                    observations[slot] = slots[slot].send(decode)
                 while ended:
                     request, result = ended.pop(0)
                     if not isinstance(result, Exception):
-                        result = dataclasses.replace(result, wall_seconds=result.wall_seconds / len(places))
+                        result = dataclasses.replace(result, wall_seconds=result.wall_seconds / len(slots))
                     yield request, result
             decodes = {}
             if observations:
-                found = decoder.decode([states[place] for place in observations], list(observations.values()))
+                found = decoder.decode([states[slot] for slot in observations], list(observations.values()))
                 decodes = dict(zip(observations, found, strict=True))
     finally:
-        for running in places:
+        for running in slots:
             running.close()
 
 
@@ -154,11 +154,11 @@ def _one_after_another(
 ) -> Generator[Observation, DecodeRecord, None]:
     """Run waiting episodes one after another, until none is left.
 
-    A batch runs several of these generators at once, one in each of its places. The generator yields an observation;
+    A batch runs several of these generators at once, one in each of its slots. The generator yields an observation;
     send it the record of the decode.
 
     Args:
-        state: Follows the episodes of this place of the batch, one after another.
+        state: Follows the episodes of this slot of the batch, one after another.
         waiting: Requests that have not begun. If possible, the next one has the same task as the last.
         ended: Each request is appended when it ends, with the record of its episode or its error.
         open_world: Opens a world for a task.

@@ -20,7 +20,7 @@ import sqlalchemy as sa
 
 from kerv_cli.base.errors import CheckpointError, KervError, StorageError, UsageError
 from kerv_cli.base.files import storage_errors
-from kerv_cli.base.places import results_dir
+from kerv_cli.base.paths import results_dir
 from kerv_cli.episodes.rows import EPISODE_SCHEMA, FLAG, FLOAT, INT
 from kerv_cli.lab.command import current_store, without_passwords
 

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from kerv_cli.base.errors import CheckpointError, Interrupted, KervError, StorageError, UsageError
-from kerv_cli.base.places import check_writable
+from kerv_cli.base.paths import check_writable
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.engine.record import EpisodeRecord

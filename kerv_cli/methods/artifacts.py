@@ -15,7 +15,7 @@ from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.limits import check_name
 from kerv_cli.base.manifests import check_files, read_file
-from kerv_cli.base.places import artifact_or_path
+from kerv_cli.base.paths import artifact_or_path
 from kerv_cli.base.registry import ArtifactPart
 from kerv_cli.base.runtime import DTYPES
 from kerv_cli.base.spaces import ActionSpace

@@ -20,7 +20,7 @@ import sqlalchemy as sa
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_json
-from kerv_cli.base.places import results_dir
+from kerv_cli.base.paths import results_dir
 from kerv_cli.base.registry import METHOD_KINDS
 from kerv_cli.episodes.identity import ENGINE
 from kerv_cli.episodes.policy import artifacts_of

@@ -17,7 +17,7 @@ import pandas as pd
 import pyarrow.compute as pc
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.places import as_path
+from kerv_cli.base.paths import as_path
 from kerv_cli.engine.cost import COUNTED, READ_PHASES, Profile, Work, prices, read_profile, work_of
 from kerv_cli.episodes.identity import batch_of
 from kerv_cli.report.measures import measure, paired

@@ -16,7 +16,7 @@ from importlib.metadata import version
 import numpy as np
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.places import results_dir
+from kerv_cli.base.paths import results_dir
 from kerv_cli.base.spaces import Observation
 from kerv_cli.catalogue.evaluations import path_of, write_served
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord

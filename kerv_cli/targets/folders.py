@@ -7,7 +7,7 @@ from pathlib import Path
 from kerv_cli.base.config import conf_dir
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import read_yaml_lines
-from kerv_cli.base.places import artifact_or_path, results_dir
+from kerv_cli.base.paths import artifact_or_path, results_dir
 
 RELEASED = ("libero-state", "mt10-state", "mt10-vision", "mt10-vision-parallel", "mt50-plain", "mt50-vision")
 """Names of the shipped policies. A checkout contains all of them, the wheel only `mt10-vision`."""

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import write_json
 from kerv_cli.base.manifests import read
-from kerv_cli.base.places import artifact
+from kerv_cli.base.paths import artifact
 from kerv_cli.targets import checkpoint
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.compilable import compile_parts

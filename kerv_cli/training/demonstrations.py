@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.places import artifact_or_path
+from kerv_cli.base.paths import artifact_or_path
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.episodes.settings import DEFAULT_TASKS
 from kerv_cli.lab.database import Database

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.places import artifact
+from kerv_cli.base.paths import artifact
 from kerv_cli.base.runtime import set_up
 from kerv_cli.episodes.runner import success_of
 from kerv_cli.lab.database import Database

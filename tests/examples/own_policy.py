@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kerv_cli.base.places import artifact
+from kerv_cli.base.paths import artifact
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.targets import TargetPart
 from kerv_cli.targets.checkpoint import TargetDescription, load_state, save_module, target_fields

@@ -395,6 +395,9 @@ def acceptance_length(target: Target, network: EagleNetwork, prompts: list[Tenso
     """
     proposer = DrafterProposer(network, target, depth=5, top_k=1, nodes=5)
     decoder = Decoder(target, Parts(RelaxedRule(target.actions), Fixed(r), proposer=proposer))
-    chunks = [decoder.decode_prompt(prompt) for prompt in prompts]
-    rounds = [one for chunk in chunks for one in chunk.rounds if one.tree_size]
-    return sum(one.committed for one in rounds) / max(1, len(rounds))
+    committed = rounds = 0
+    for prompt in prompts:
+        for one in decoder.decode_prompt(prompt).rounds:
+            committed += one.committed * (one.tree_size > 0)
+            rounds += one.tree_size > 0
+    return committed / max(1, rounds)

@@ -96,8 +96,10 @@ class ScoutNetwork(Compilable):
             features of the cells (of the encoder's grid over the view), and image points.
         """
         assert inputs.images is not None
-        views = [stem(image) for stem, image in zip(self.stems, inputs.images.split(self.size, -1), strict=True)]
-        return [inputs.proprioception, self.words(inputs.words).mean(1), *(part for view in views for part in view)]
+        found = [inputs.proprioception, self.words(inputs.words).mean(1)]
+        for stem, image in zip(self.stems, inputs.images.split(self.size, -1), strict=True):
+            found += stem(image)
+        return found
 
     def see(self, proprioception: Tensor, words: Tensor, *views: Tensor) -> tuple[Tensor, Tensor]:
         """Compute the drafter's input features and the estimated positions of the places.
@@ -110,7 +112,9 @@ class ScoutNetwork(Compilable):
         Returns:
             Features (B, F), and the positions (B, K, 3) in metres of K places, such as object and goal.
         """
-        cells = [part for grid in views[::2] for part in (grid.mean(1), self.cells(grid).flatten(1))]
+        cells: list[Tensor] = []
+        for grid in views[::2]:
+            cells += grid.mean(1), self.cells(grid).flatten(1)
         located = self.locate(torch.cat([*views[1::2], hand_features(proprioception, self.centre), words], -1))
         places = located.unflatten(-1, (-1, 3)) * 0.1 + self.centre
         scene = scene_features(proprioception, places, self.centre)

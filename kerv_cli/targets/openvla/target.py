@@ -25,7 +25,7 @@ from torch import Tensor
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import write_json
 from kerv_cli.base.manifests import read
-from kerv_cli.base.places import artifact
+from kerv_cli.base.paths import artifact
 from kerv_cli.base.runtime import DTYPES, set_up
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.engine.transfer import upload

@@ -26,7 +26,7 @@ from PIL import Image
 
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.base.files import read_mapping, regular, write_folder, write_json
-from kerv_cli.base.places import as_path
+from kerv_cli.base.paths import as_path
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, action_limits
 from kerv_cli.worlds import EnvironmentPart
 from kerv_cli.worlds.demos.dataset import (
