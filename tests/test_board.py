@@ -271,7 +271,7 @@ def test_a_failed_training_shows_its_curves_why_it_failed_and_what_to_type(addre
     page.get_by_role("link", name="target/mine").click()
     assert "the disk is full" in page.locator("main").inner_text()
     assert "kerv train target name=mine" in page.locator(".command").inner_text()
-    page.locator(".chart svg").get_by_text("train_loss").wait_for()
+    page.locator(".chart svg").get_by_text("training loss").wait_for()
 
 
 def test_a_study_shows_numbers_on_hovering_and_differences_on_a_click(address, open_page):

@@ -116,7 +116,7 @@ def test_what_is_not_shown_yet_says_how_many_pairs_more_would_do(rows):
     assert (found.chosen, found.candidate) == ("", "r=9")
     assert found.candidate_pairs == pairs_to_settle(PairedCounts(188, 2, 2, 8), 0.02) > 200
     said = sentence(found, 2.0, "ar")
-    assert "r=9 is the fastest setting that may keep the success: 1.50 (1.40–1.60 of this run) times as fast" in said
+    assert "the fastest setting that may keep the success is r=9: 1.50 (1.40–1.60 of this run) times as fast" in said
     assert said.endswith("more pairs would show it for r=9")
     assert episodes_to_settle(rows, 2.0) == math.ceil(found.candidate_pairs)
     assert episodes_to_settle(rows, 4.0) == 0, "a setting is named already"

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 from studies_synthetic import part, points_of, settings_of, still_episode, study_of, swept, threshold_study
 
+from kerv_cli.base.config import groups
 from kerv_cli.engine.record import DecodeRecord, Round
 from kerv_cli.engine.tally import Tally
 from kerv_cli.episodes.settings import RolloutSettings
@@ -28,6 +29,7 @@ from kerv_cli.lab.database import opened
 from kerv_cli.lab.plan import Episode, Setting, Study
 from kerv_cli.lab.store import StudyStore, plan_study
 from kerv_cli.lab.work import RunEpisode
+from kerv_cli.report.glossary import METHODS, UNVERIFIED, WORDS, explained
 from kerv_cli.report.page import render
 from kerv_cli.report.plots import acceptance_figure, curves_figure, png, study_figures, with_lines
 from kerv_cli.report.report import Unpublishable, refusals, report
@@ -298,6 +300,18 @@ def test_repeats_are_paired_with_their_own(tmp_path):
     assert (row["pairs"], row["episodes"], row["repeats"], row["seeds"]) == (2, 4, 2, "100000-100001")
     assert (row["successes"], row["both"], row["success_low"]) == (2, 2, pytest.approx(wilson(2, 2).low))
     assert row["speedup"] == row["speedup_low"] == row["speedup_high"] == pytest.approx(2.0)
+
+
+def test_every_method_is_explained_in_about_ten_words():
+    for method in groups()["method"]:
+        assert 5 <= len(explained(method, method).split()) <= 22, method
+    for text in (*METHODS.values(), *WORDS.values(), UNVERIFIED):
+        assert 5 <= len(text.split()) <= 12, text
+    tree, chain = explained("spec_vla"), explained("spec_vla chain", "spec_vla")
+    assert chain == f"{tree}; {WORDS['chain']}"
+    assert explained("one_pass, skip added", "one_pass") == f"{METHODS['one_pass']}; {WORDS['skip']}"
+    assert explained("heisd_tuned r=9", "heisd_tuned") == f"{METHODS['heisd']}; {WORDS['tuned']}"
+    assert explained("mine") == ""
 
 
 def test_neighbours_in_the_order_of_speed_are_compared_with_each_other(data):
@@ -579,6 +593,6 @@ def test_a_trainings_curves_mark_the_best_validation():
     log = pd.DataFrame({"step": [10, 20, 30], "score": [0.1, 0.9, 0.5], "loss": [3.0, 2.0, 1.0]})
     figure = curves_figure(log)
     panels = figure.to_dict()["concat"]
-    assert [panel["title"] for panel in panels] == ["score", "loss"]
+    assert [panel["title"] for panel in panels] == ["validation score (the best is kept)", "loss"]
     assert [panel["layer"][0]["encoding"]["x"]["datum"] for panel in panels] == [20.0, 20.0]
     assert png(figure, "a", "b") == png(figure, "a", "b")

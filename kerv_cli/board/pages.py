@@ -13,6 +13,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse
 
 from kerv_cli.lab.database import Database
+from kerv_cli.report.glossary import with_code
 from kerv_cli.report.results import is_number
 
 TEMPLATES = Environment(
@@ -48,7 +49,7 @@ def figure(value: float) -> str:
     return f"{value:.4g}" if is_number(value) else "–"
 
 
-TEMPLATES.filters |= {"few": few, "page_of": page_of, "figure": figure}
+TEMPLATES.filters |= {"few": few, "page_of": page_of, "figure": figure, "code": with_code}
 
 
 def database_of(request: Request) -> Database:

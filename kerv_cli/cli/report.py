@@ -40,6 +40,9 @@ Choose = Annotated[
 ]
 
 
+Explain = Annotated[bool, typer.Option("--explain", help="Say in ten words what each setting of the table is.")]
+
+
 AllColumns = Annotated[bool, typer.Option("--all", help="Print all columns of the table, in several parts if needed.")]
 
 
@@ -56,6 +59,7 @@ def report(
     publish: Publish = False,
     choose: Choose = False,
     all_columns: AllColumns = False,
+    explain: Explain = False,
     as_json: AsJson = False,
 ) -> None:
     """Write CSV tables (per task and aggregated), plots and an HTML page about the studies."""
@@ -72,7 +76,7 @@ def report(
     if as_json:
         end_with_json(_as_json(reports))
     for one in reports:
-        print_study(one.data, all_columns, "--all")
+        print_study(one.data, all_columns, "--all", explain)
     for one in reports:
         print_prices(one.priced)
     for one in reports:

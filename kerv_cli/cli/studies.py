@@ -229,7 +229,7 @@ def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None =
     return on_event
 
 
-def print_study(data: StudyData, all_columns: bool = False, how: str = "") -> None:
+def print_study(data: StudyData, all_columns: bool = False, how: str = "", explain: bool = False) -> None:
     """Print the table of a study and its note.
 
     If times cannot be compared, because they were not measured in turn, print the command that measures them again.
@@ -238,13 +238,18 @@ def print_study(data: StudyData, all_columns: bool = False, how: str = "") -> No
         data: The study.
         all_columns: Print all columns, not only those that people need first.
         how: What to type to see all columns. Empty: `kerv report study=NAME --all`.
+        explain: Say in a few words what each setting is.
     """
+    from kerv_cli.report.glossary import explanations
     from kerv_cli.report.summary import SummaryTable, not_in_turn
     from kerv_cli.report.tables import split_values
 
     store = data.store
     how = how or f"kerv report study={store.name}{results_word(store.database.words)} --all"
     console().print(SummaryTable(data.results, all_columns, how))
+    if explain:
+        for name, text in explanations((one.label, one.settings["method"]) for one in data.study.settings).items():
+            typer.echo(f"{name}: {text}")
     codes = split_values(row.provenance["code"] for row in data.results)
     if len(codes) > 1:
         commits = split_values(row.provenance["git_commit"] for row in data.results)

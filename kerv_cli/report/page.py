@@ -16,6 +16,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from kerv_cli.episodes.identity import NOT_DETERMINING, without
 from kerv_cli.lab.store import SWEEP
+from kerv_cli.report.glossary import explanations, with_code
 from kerv_cli.report.plots import about, acceptance_figure, latency_figure, library, study_figures
 from kerv_cli.report.reprice import ASSUMES, Priced, repriced_summary
 from kerv_cli.report.results import MACRO, Result, is_number
@@ -36,7 +37,9 @@ def render(data: StudyData, loss: float, priced: Sequence[Priced] = (), tables: 
     `study_parts` explains the arguments.
     """
     loader = PackageLoader("kerv_cli.report", "templates")
-    template = Environment(loader=loader, autoescape=True, undefined=StrictUndefined).get_template("study.html")
+    templates = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
+    templates.filters["code"] = with_code
+    template = templates.get_template("study.html")
     values = study_parts(data, loss, priced, tables) | {"films": _films(data)}
     return template.render(**values, library=library())
 
@@ -73,6 +76,7 @@ def study_parts(
         "results": "" if results == "results" else f" results={shlex.quote(results)}",
         "baseline": data.study.baseline,
         "main": MAIN,
+        "explained": explanations((row.label, row.method) for row in rows),
         "columns": f"{NOTE} {of_runs(rows)}",
         "suite": _suite(rows),
         "charts": [figure.to_dict() for figure in figures.values()],

@@ -241,18 +241,31 @@ def _best_step(log: pd.DataFrame) -> float:
     return float(log["step"].to_numpy()[int(log["score"].to_numpy().argmax())])
 
 
+CURVES = {
+    "train_loss": "training loss",
+    "score": "validation score (the best is kept)",
+    "token_accuracy": "share of equal tokens",
+    "within_9": "share of tokens within 9 bins",
+    "action_l1": "error of the action",
+    "acceptance_length_strict": "accepted tokens, equal only",
+    "acceptance_length_r9": "accepted tokens, within 9 bins",
+}
+"""Column of a training's log -> what a chart calls it."""
+
+
 def curves_figure(log: pd.DataFrame) -> alt.ConcatChart:
     """Draw every measure of a training's log against the training step. Mark the best validation."""
     best = _best_step(log)
     charts = []
     for name in log.columns.drop("step"):
         data = log[["step", name]].rename(columns={name: "value"})
-        shown = ["step:Q", alt.Tooltip("value:Q", title=str(name))]
-        base = alt.Chart(data).encode(x=alt.X("step:Q", title="step"), tooltip=shown)
+        title = CURVES.get(str(name), str(name).replace("_", " ").replace("l1 ", "error of "))
+        shown = ["step:Q", alt.Tooltip("value:Q", title=title)]
+        base = alt.Chart(data).encode(x=alt.X("step:Q", title="training step"), tooltip=shown)
         y = alt.Y("value:Q", scale=alt.Scale(zero=False), title=None)
         line = base.mark_line(color=BLUE, point={"size": 30, "color": BLUE}).encode(y=y)
         mark = alt.Chart().mark_rule(strokeDash=[4, 3], color=MUTED).encode(x=alt.datum(best, type="quantitative"))
-        charts.append((mark + line).properties(title=str(name), width=_WIDTH, height=_HEIGHT))
+        charts.append((mark + line).properties(title=title, width=_WIDTH, height=_HEIGHT))
     return _chart(charts, _ACROSS)
 
 

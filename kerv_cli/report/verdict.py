@@ -74,7 +74,7 @@ def sentence(choice: Choice, loss: float, baseline: str) -> str:
     if not choice.candidate:
         return f"{pairs} cannot show a setting that is faster and {bound}; {_missing(choice)}"
     factor = f": {_factor(choice)}" if is_number(choice.episode_speedup.value) else ""
-    fastest = f"{choice.candidate} is the fastest setting that may keep the success{factor}"
+    fastest = f"the fastest setting that may keep the success is {choice.candidate}{factor}"
     return f"{fastest}. {pairs} cannot show that it {bound}; {_missing(choice)}"
 
 

@@ -41,6 +41,15 @@ function showStudy(root) {
     body.append(...[...body.rows].sort((a, b) => compare(text(a), text(b), way === "ascending" ? 1 : -1)));
   };
 
+  // What a table cuts off, it says.
+  const cut = new ResizeObserver((entries) => {
+    for (const { target } of entries) {
+      const place = target.closest(".scroll");
+      place.classList.toggle("cut", place.scrollWidth > place.clientWidth + 1);
+    }
+  });
+  for (const one of root.querySelectorAll(".scroll, .scroll > table")) cut.observe(one);
+
   // Charts take the width of their place, and are drawn again when it changes.
   const tip = document.querySelector("dl.tip") ?? document.body.appendChild(document.createElement("dl"));
   tip.className = "tip";
