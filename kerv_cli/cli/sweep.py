@@ -68,7 +68,8 @@ def _list_studies(as_json: bool) -> None:
     for name in groups()["study"]:
         study = compose("sweep", [f"study={name}"], SweepSettings).study
         common = compose("rollout", split(study.common), RolloutSettings)
-        settings, tasks = sum(len(expand(split(text))) for text in study.settings.values()), len(tasks_of(common))
+        grids = [expand(split(text)) for text in study.settings.values()]
+        settings, tasks = sum(map(len, grids)), len(tasks_of(common))
         counts = {"settings": settings, "tasks": tasks, "episodes": common.episodes}
         rows.append({"study": name, **counts, "in all": settings * tasks * common.episodes, "title": study.title})
     if as_json:
@@ -87,8 +88,8 @@ def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, planned: Plan, as_
         end_with_plan(text, as_json)
     store, there = planned.store, [*outcome.done, *outcome.reused]
     data = load_study(store, there) if there else None
-    failed = [one for failure in outcome.failed for one in failure.episodes]
-    counts = {"run": len(outcome.done), "reused": len(outcome.reused), "failed": len(failed)}
+    failed = sum(len(failure.episodes) for failure in outcome.failed)
+    counts = {"run": len(outcome.done), "reused": len(outcome.reused), "failed": failed}
     for failure in outcome.failed:
         one = failure.episodes[0]
         typer.echo(f"kerv: {one.setting.label} on {one.task}: {failure.reason}", err=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -187,9 +188,9 @@ def _one_after_another(
 
 def _take(waiting: list[Request[K]], task: str) -> Request[K]:
     """Remove and return a waiting request: one of `task`, else one of the task with the most requests."""
-    counts = Counter(request.task for request in waiting)
-    wanted = task if counts[task] else counts.most_common(1)[0][0]
-    return waiting.pop(next(i for i, request in enumerate(waiting) if request.task == wanted))
+    tasks = [request.task for request in waiting]
+    wanted = task if task in tasks else Counter(tasks).most_common(1)[0][0]
+    return waiting.pop(tasks.index(wanted))
 
 
 def run_batch(settings: RolloutSettings, requests: Iterable[Request[K]]) -> Iterator[EpisodeEnd[K]]:
@@ -220,7 +221,7 @@ def success_of(target: Target, tasks: Iterable[str], seeds: Sequence[int], setti
     The target decodes as it was trained to, autoregressively or in parallel.
     """
     decoder = BatchDecoder(native_decoder(target))
-    requests = [Request(None, task, seed) for task in tasks for seed in seeds]
+    requests = [Request(None, task, seed) for task, seed in itertools.product(tasks, seeds)]
     outcomes = []
     for _, result in run_together(decoder, requests, TOGETHER, lambda task: new_world(task, settings)):
         if isinstance(result, Exception):

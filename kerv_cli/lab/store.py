@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import functools
+import itertools
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -226,7 +227,7 @@ class StudyStore:
     def whole_runs(self) -> list[str]:
         """Return the ids of the commands that each ran all episodes of the study, oldest first."""
         wanted = PLANNED.join(EPISODES, _same_episode()).join(BLOCKS)
-        keys = [WANTED.c[name] for name in ("setting_id", "task", "seed", "repeat")]
+        keys = WANTED.c.setting_id, WANTED.c.task, WANTED.c.seed, WANTED.c.repeat
         with self.database.reading() as connection:
             rows = connection.execute(
                 sa.select(BLOCKS.c.run, *keys).distinct().select_from(wanted).where(STUDIES.c.name == self.name)
@@ -248,7 +249,7 @@ class StudyStore:
         import pandas as pd
 
         which = WANTED.c.episode_id == EPISODES.c.id if run is None else _same_episode()
-        circumstances = [EPISODES.c[name] for name in ("block", "order", "started", "decode_seconds")]
+        circumstances = EPISODES.c.block, EPISODES.c.order, EPISODES.c.started, EPISODES.c.decode_seconds
         with self.database.reading() as connection, self.database.checking(f"episodes of {self.name}"):
             query = (
                 sa.select(
@@ -289,9 +290,9 @@ class StudyStore:
         blobs: dict[int, bytes] = {}
         with self.database.reading() as connection:
             for first in range(0, len(episodes), _AT_ONCE):
-                part = [int(number) for number in episodes[first : first + _AT_ONCE]]
-                found = connection.execute(sa.select(DECODES).where(DECODES.c.episode_id.in_(part)))
-                blobs |= {row.episode_id: row.parquet for row in found}
+                part = map(int, episodes[first : first + _AT_ONCE])
+                found = sa.select(DECODES.c.episode_id, DECODES.c.parquet).where(DECODES.c.episode_id.in_(list(part)))
+                blobs.update(connection.execute(found).tuples())
         tables = []
         with self.database.checking(f"decodes of {self.name}"):
             for index, number in enumerate(episodes):
@@ -481,7 +482,7 @@ def plan_study(
     """
     stored = stored_episodes(database, study)
     existing, missing = split(study, stored, rerun, since, _earlier(database, study))
-    newest = max((row.id for rows in stored.values() for row in rows), default=0)
+    newest = max((row.id for row in itertools.chain(*stored.values())), default=0)
     store = StudyStore(database, study.name, study.kind)
     return Plan(study, store, existing, missing, newest, runtime or RuntimeSettings(), tuple(command))
 
