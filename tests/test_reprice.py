@@ -142,6 +142,16 @@ def test_a_report_prices_the_study_on_the_machines_that_the_study_names(tmp_path
     assert set(pd.read_csv(tmp_path / "report/tables/threshold_on.csv")["on"]) == {"there"}
 
 
+def test_a_report_of_several_studies_prices_each(tmp_path, monkeypatch):
+    monkeypatch.setattr("kerv_cli.report.report.png", lambda *arguments: b"")  # drawing takes longest
+    for name in ("first", "second"):
+        study = threshold_study(["reach-v3"], episodes=1, radii=(9,), name=name)
+        swept(tmp_path, dataclasses.replace(study, machines=("there",)))
+    profile_file(tmp_path)
+    priced = json.loads(told("report", f"results={tmp_path}", "--json"))["priced"]
+    assert {row["study"] for row in priced} == {"first", "second"}
+
+
 def test_a_study_is_also_priced_by_the_profile_of_its_own_machine(tmp_path):
     """The report, and the board's page of the study, show the estimate beside the measurement."""
     study = dataclasses.replace(threshold_study(["reach-v3"], radii=(9,)), machines=("there", "nowhere"))

@@ -7,7 +7,7 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -142,11 +142,7 @@ class StudyData:
             return []
         next_ones = dict(itertools.pairwise(order))
         runs = [speedups(paired(run, next_ones), ["label"], MICRO) for run in self.runs or (self.episodes,)]
-        found = []
-        for label in order:
-            several = [run.get(label, Speeds()).episode_speedup for run in runs]
-            found.append((label, stats.over_runs(several, self.same_pairs) if self.runs else several[0]))
-        return found
+        return [(label, _over_runs(runs, label, self.same_pairs).episode_speedup) for label in order]
 
     @functools.cached_property
     def tallies(self) -> dict[str, Tally]:
@@ -333,10 +329,8 @@ def _results(data: StudyData, averaging: str, by_task: bool = False) -> list[Res
         values = {name: pd.unique(column[indices[group]]) for name, column in texts.items()}
         label = group[1] if by_task else group
         measures = measured[group]
-        if runs:  # docs/methods.md §7
-            speeds = zip(*(run.get(group, Speeds()) for run in runs), strict=True)
-            combined = Speeds(*(stats.over_runs(several, data.same_pairs) for several in speeds))
-            measures = replace(measures, **combined._asdict())
+        if runs:
+            measures = replace(measures, **_over_runs(runs, group, data.same_pairs)._asdict())
         setting = data.settings[label]
         stress = stress_of(setting.settings)
         row = Result(
@@ -365,6 +359,20 @@ def _results(data: StudyData, averaging: str, by_task: bool = False) -> list[Res
         )
         results.append(row)
     return results
+
+
+def _over_runs(runs: Sequence[Mapping[Hashable, Speeds]], group: Hashable, same_pairs: bool) -> Speeds:
+    """Return the speeds of a group over all runs (docs/methods.md §7).
+
+    Args:
+        runs: What `speedups` returned for each run.
+        group: Key of the group in those results.
+        same_pairs: Whether all runs measured the same pairs.
+    """
+    several = [run.get(group, Speeds()) for run in runs]
+    if len(several) == 1:
+        return several[0]
+    return Speeds(*(stats.over_runs(speeds, same_pairs) for speeds in zip(*several, strict=True)))
 
 
 def _texts_of(episodes: pd.DataFrame) -> dict[str, np.ndarray]:
