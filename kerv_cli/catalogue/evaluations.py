@@ -234,7 +234,7 @@ def labelled(recordings: Sequence[list[Evaluation]], labels: Sequence[str] = ())
 
 
 def _check_same_episodes(names: str, first: Sequence[Evaluation], other: Sequence[Evaluation]) -> None:
-    ours, theirs = ({one.benchmark: one for one in side} for side in (first, other))
+    ours, theirs = {one.benchmark: one for one in first}, {one.benchmark: one for one in other}
     shared = [benchmark for benchmark in ours if benchmark in theirs]
     if not shared:
         raise UsageError(f"{names} have different benchmarks: {', '.join(ours)} and {', '.join(theirs)}")

@@ -208,17 +208,17 @@ def with_matched_speed(rows: Sequence[Result]) -> list[Result]:
     the baseline itself, and if the baseline does not solve the tasks.
 
     Args:
-        rows: One row per setting, with one way of averaging.
+        rows: One row per setting and task, or per setting and way of averaging.
     """
-    solved = {row.label for row in rows if row.is_baseline and row.measures.success.value >= SOLVED}
-    compared = [row for row in rows if row.baseline in solved and not row.is_baseline and row.measures.pairs]
-    groups: dict[tuple[str, str], list[Result]] = {}
-    for row in sorted(compared, key=safety):
-        groups.setdefault((row.method, row.baseline), []).append(row)
+    solved = {(row.where, row.label) for row in rows if row.is_baseline and row.measures.success.value >= SOLVED}
+    groups: dict[tuple[str, str, str], list[Result]] = {}
+    for row in rows:
+        if (row.where, row.baseline) in solved and not row.is_baseline and row.measures.pairs:
+            groups.setdefault((row.where, row.method, row.baseline), []).append(row)
     matched = []
     for row in rows:
-        group = [] if row.is_baseline else passing(groups.get((row.method, row.baseline), ()), MARGIN)
-        speeds = [one.measures.episode_speedup.value for one in group]
+        group = [] if row.is_baseline else groups.get((row.where, row.method, row.baseline), [])
+        speeds = [one.measures.episode_speedup.value for one in passing(sorted(group, key=safety), MARGIN)]
         fastest = max((speed for speed in speeds if speed > 0), default=math.nan)
         matched.append(replace(row, matched_success_speed=fastest))
     return matched

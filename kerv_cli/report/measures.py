@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ import pandas as pd
 from kerv_cli.base.registry import ColumnPart
 from kerv_cli.engine.record import PHASES
 from kerv_cli.report import statistics as stats
-from kerv_cli.report.results import MACRO, MICRO, Measures
+from kerv_cli.report.results import MACRO, MICRO, RATIO, Measures
 from kerv_cli.report.statistics import Estimate
 
 NEAR = 0.02
@@ -23,20 +24,7 @@ MARGIN = 0.03
 COMPARABLE = ("device", "device_name", "dtype", "threads")
 """Columns in which two episodes must agree before their times are compared."""
 
-_RATIOS = {
-    "AL": ("committed", "verifications"),
-    "accepted_per_round": ("accepted", "verifications"),
-    "AFEP": ("first_rejected_sum", "first_rejected_count"),
-    "forwards_per_step": ("forwards", "steps"),
-    "skip_rate": ("skipped_decodes", "decodes"),
-    "unverified_share": ("unverified_tokens", "executed_tokens"),
-    "compensation_rate": ("compensated_decodes", "decodes"),
-    "retrieval_share": ("retrieval_decodes", "decodes"),
-    "deviation": ("deviation_sum", "deviation_count"),
-    "felt_latency_ms": ("delay_seconds", "delay_decodes"),
-    "felt_latency_steps": ("delay_steps", "delay_decodes"),
-    "held_share": ("held_steps", "steps"),
-}
+_RATIOS = {one.name: one.metadata[RATIO] for one in fields(Measures) if RATIO in one.metadata}
 """Measure -> (numerator, denominator), each a column summed over episodes. NaN if the denominator is 0."""
 _PHASES = [f"ms.{phase}" for phase in PHASES]
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from numbers import Real
 from typing import Any
 
@@ -20,6 +20,8 @@ Row = dict[str, Any]
 
 MICRO = "micro over tasks"
 MACRO = "macro over difficulty groups"
+RATIO = "ratio"
+"""Key of a measure's metadata: the columns of the episodes whose sums are its numerator and its denominator."""
 
 
 @dataclass(frozen=True)
@@ -80,18 +82,18 @@ class Measures:
     latency_p50_ms: float
     latency_p95_ms: float
     latency_worst_ms: float
-    AL: float
-    accepted_per_round: float
-    AFEP: float
-    forwards_per_step: float
-    skip_rate: float
-    unverified_share: float
-    compensation_rate: float
-    retrieval_share: float
-    deviation: float
-    felt_latency_ms: float
-    felt_latency_steps: float
-    held_share: float
+    AL: float = field(metadata={RATIO: ("committed", "verifications")})
+    accepted_per_round: float = field(metadata={RATIO: ("accepted", "verifications")})
+    AFEP: float = field(metadata={RATIO: ("first_rejected_sum", "first_rejected_count")})
+    forwards_per_step: float = field(metadata={RATIO: ("forwards", "steps")})
+    skip_rate: float = field(metadata={RATIO: ("skipped_decodes", "decodes")})
+    unverified_share: float = field(metadata={RATIO: ("unverified_tokens", "executed_tokens")})
+    compensation_rate: float = field(metadata={RATIO: ("compensated_decodes", "decodes")})
+    retrieval_share: float = field(metadata={RATIO: ("retrieval_decodes", "decodes")})
+    deviation: float = field(metadata={RATIO: ("deviation_sum", "deviation_count")})
+    felt_latency_ms: float = field(metadata={RATIO: ("delay_seconds", "delay_decodes")})
+    felt_latency_steps: float = field(metadata={RATIO: ("delay_steps", "delay_decodes")})
+    held_share: float = field(metadata={RATIO: ("held_steps", "steps")})
     added: Mapping[str, float]
     counts: PairedCounts
     mcnemar_p: float
@@ -174,6 +176,11 @@ class Result:
     stress_level: int
     provenance: Mapping[str, str]
     matched_success_speed: float = math.nan
+
+    @property
+    def where(self) -> str:
+        """The task if the row is of one task, else the way of averaging."""
+        return self.averaging if self.averaging in (MICRO, MACRO) else self.task
 
     @property
     def is_baseline(self) -> bool:

@@ -157,15 +157,12 @@ class StudyData:
     @functools.cached_property
     def results(self) -> list[Result]:
         """Two rows per setting: one pools all tasks (MICRO), one averages over difficulty groups (MACRO)."""
-        return [*with_matched_speed(_results(self, MICRO)), *with_matched_speed(_results(self, MACRO))]
+        return with_matched_speed([*_results(self, MICRO), *_results(self, MACRO)])
 
     @functools.cached_property
     def task_results(self) -> list[Result]:
         """One row per task and setting. Tasks are sorted by name, settings are in the study's order."""
-        tasks: dict[str, list[Result]] = {}
-        for row in _results(self, "one task", by_task=True):
-            tasks.setdefault(row.task, []).append(row)
-        return [row for rows in tasks.values() for row in with_matched_speed(rows)]
+        return with_matched_speed(_results(self, "one task", by_task=True))
 
     @functools.cached_property
     def table(self) -> pd.DataFrame:
@@ -289,14 +286,10 @@ def tally_of(store: StudyStore, episodes: Sequence[int]) -> Tally | None:
             continue
         start, accepted, nodes = (rounds.field(name).to_numpy() for name in ("start", "accepted", "tree_size"))
         judged = pc.list_value_length(rounds.field("drafted")).to_numpy().astype(np.int64)
-        tally = Tally.of(start, judged, accepted, nodes, _dofs(store, part[0]))
+        dofs = len(store.decodes(part[:1], ("actions",))["actions"][0].as_py()[0])
+        tally = Tally.of(start, judged, accepted, nodes, dofs)
         total = tally if total is None else total + tally
     return total
-
-
-def _dofs(store: StudyStore, episode: int) -> int:
-    """Return the number of DoFs of an episode's actions."""
-    return len(store.decodes([episode], ("actions",))["actions"][0].as_py()[0])
 
 
 def difficulty_of(task: str) -> str:
@@ -454,8 +447,7 @@ def further_of(data: StudyData) -> dict[str, Any]:
             "provenance": {name: setting.settings["runtime"][name] for name in _RUNTIME} | dict(row.provenance),
             "measures": {},
         }
-        key = row.task if row.averaging not in (MICRO, MACRO) else row.averaging
-        labels.setdefault(row.label, about)["measures"][key] = _further_measures(row)
+        labels.setdefault(row.label, about)["measures"][row.where] = _further_measures(row)
     for label, tally in data.tallies.items():
         labels[label]["acceptance"] = tally.as_dict()
     return {"study": data.study.name, "axis": data.study.axis, "labels": labels}
