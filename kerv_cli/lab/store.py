@@ -292,7 +292,8 @@ class StudyStore:
             for first in range(0, len(episodes), _AT_ONCE):
                 part = map(int, episodes[first : first + _AT_ONCE])
                 found = sa.select(DECODES.c.episode_id, DECODES.c.parquet).where(DECODES.c.episode_id.in_(list(part)))
-                blobs.update(connection.execute(found).tuples())
+                for row in connection.execute(found):
+                    blobs[row.episode_id] = row.parquet
         tables = []
         with self.database.checking(f"decodes of {self.name}"):
             for index, number in enumerate(episodes):
