@@ -78,11 +78,17 @@ class DemoEpisode:
         return self.states[:, :3]
 
 
-def save_episode(path: Path, episode: DemoEpisode) -> None:
+def save_episode(path: Path, episode: DemoEpisode, level: int = 6) -> None:
     """Write an episode to a file, atomically.
 
     The PNG files of all images are stored end to end in one tensor. Another tensor holds their n + 1 offsets. Memory
     holds one image at a time: the PNG files wait in a temporary file until their sizes are known.
+
+    Args:
+        path: The file.
+        episode: The episode.
+        level: Compression of the images, from 1 (five times as fast, 7 % more bytes) to 9. Equal recordings must have
+            equal bytes, so they always use the default.
 
     Raises:
         StorageError: Writing failed.
@@ -103,7 +109,7 @@ def save_episode(path: Path, episode: DemoEpisode) -> None:
         temporary.open("wb") as file,
         tempfile.TemporaryFile(dir=path.parent) as pictures,
     ):
-        sizes = [pictures.write(encode_png(frame)) for frame in episode.frames]
+        sizes = [pictures.write(encode_png(frame, level)) for frame in episode.frames]
         tensors = {
             "png": np.zeros(0, np.uint8),  # the pictures follow
             "png_offsets": np.cumsum([0, *sizes], dtype=np.int64),
@@ -274,10 +280,10 @@ def header_of(data: bytes) -> tuple[dict[str, Any], int]:
     return json.loads(data[LENGTH.size : begin]), begin
 
 
-def encode_png(frame: NDArray[np.uint8]) -> bytes:
-    """Return an image (height, width, 3) uint8 as a PNG file."""
+def encode_png(frame: NDArray[np.uint8], level: int = 6) -> bytes:
+    """Return an image (height, width, 3) uint8 as a PNG file, see `save_episode`."""
     buffer = io.BytesIO()
-    Image.fromarray(frame).save(buffer, format="PNG", compress_level=6)
+    Image.fromarray(frame).save(buffer, format="PNG", compress_level=level)
     return buffer.getvalue()
 
 

@@ -371,7 +371,7 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
         limits.append(np.stack([episode.executed.min(0), episode.executed.max(0)]))
         state = episode.states.shape[1]
         path = episode_path(folder, episode.task, episode.seed)
-        save_episode(path, episode)
+        save_episode(path, episode, level=1)  # a small file may hold many pixels
         entries.setdefault(episode.task, []).append(EpisodeEntry.of(path, episode))
         progress(done + 1, len(chosen))
     proprioception = tuple(source.names(STATE, "state")[:state])
