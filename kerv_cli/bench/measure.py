@@ -259,7 +259,7 @@ def source_decoders(settings: BenchSettings) -> dict[str, Any]:
     The time of these drafts does not depend on the size of the target. A draft that cannot be measured, for example
     because its drafter is missing, is left out, and a warning says why.
     """
-    words = [f"runtime.{name}={getattr(settings.runtime, name)}" for name in ("device", "threads")]
+    words = [f"runtime.device={settings.runtime.device}", f"runtime.threads={settings.runtime.threads}"]
     found = {}
     for kind, method in source_methods().items():
         try:

@@ -131,8 +131,9 @@ def _counts(decodes: Sequence[TracedDecode]) -> tuple[np.ndarray, np.ndarray]:
     """
     chains = []
     for number, decode in zip(_numbers(decodes), decodes, strict=True):
-        drafts = [one for one in decode.rounds if one.drafted and one.start and not one.depth and one.mode == "forward"]
-        chains += [(number, one.drafted, one.accepted) for one in drafts]
+        for one in decode.rounds:
+            if one.drafted and one.start and not one.depth and one.mode == "forward":
+                chains += [(number, one.drafted, one.accepted)]
     if not chains:
         return np.zeros((0, 0)), np.zeros((0, 0))
     numbers, drafted, taken = np.array(chains).T

@@ -498,7 +498,7 @@ def task_levels(matches: Matches, confidence: float) -> SkipLevel:
     s_min = lowest_level(matches, confidence)
     if s_min is None:
         return SkipLevel(NEVER, NEVER, NEVER, share=0.0, entries=len(similarity))
-    low, high = (lowest_level(matches, 1 - wrong * factor) for factor in (LOW, HIGH))
+    low, high = lowest_level(matches, 1 - wrong * LOW), lowest_level(matches, 1 - wrong * HIGH)
     skipped = similarity >= s_min
     return SkipLevel(
         s_min,

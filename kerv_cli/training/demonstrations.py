@@ -41,10 +41,10 @@ def open_demos(database: Database, names: str, tasks: Sequence[str] = (), episod
         UsageError: A name cannot be the name of a folder.
         CheckpointError: A dataset is missing, unfinished or damaged, or the datasets cannot be joined.
     """
-    whole = artifact_or_path(str(database.results), "demos", names)
-    if whole.is_dir():  # its name may contain a plus
-        return DemoDataset.joined([_opened(database, whole, tasks, episodes)])
-    folders = [artifact_or_path(str(database.results), "demos", name) for name in names.split("+")]
+    results, parts = str(database.results), names.split("+")
+    if artifact_or_path(results, "demos", names).is_dir():  # its name may contain a plus
+        parts = [names]
+    folders = [artifact_or_path(results, "demos", name) for name in parts]
     return DemoDataset.joined([_opened(database, folder, tasks, episodes) for folder in folders])
 
 
@@ -126,12 +126,12 @@ def check_tasks(dataset: DemoDataset, names: Sequence[str]) -> None:
     Raises:
         CheckpointError: A task has no episode. The message names the first such task.
     """
-    recorded = list(dict.fromkeys(entry.task for entry in dataset.episodes))
     for task in names:
-        if task not in recorded:
+        if not dataset.of_tasks(task):
+            recorded = ", ".join(dataset.manifest.tasks)
             raise CheckpointError(
                 f"the demonstrations in {dataset.path} hold no episode of {task}: leave task= out for those of "
-                f"{', '.join(recorded)}, or record others with 'kerv demos task={task}' and name them by demos="
+                f"{recorded}, or record others with 'kerv demos task={task}' and name them by demos="
             )
 
 

@@ -300,9 +300,10 @@ def until_interrupted() -> Iterator[threading.Event]:
             print(f"stopping after this step; {again} stops at once and keeps the last saved state", file=sys.stderr)
         stop.set()
 
-    # a shell's background job and nohup ignore SIGINT
-    signals = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is not signal.SIG_IGN]
-    before = {number: signal.signal(number, handle) for number in signals}
+    before = {}
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # a shell's background job and nohup ignore SIGINT
+            before[number] = signal.signal(number, handle)
     try:
         yield stop
     finally:

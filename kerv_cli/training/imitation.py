@@ -157,9 +157,11 @@ def lit(images: Tensor, indices: Tensor, step: int, spread: float) -> Tensor:
     Returns:
         (B, 3, h, w) uint8.
     """
-    draws = [np.random.default_rng((step, index)) for index in indices.tolist()]
-    fields = np.stack([spread * r.uniform() * r.normal(size=(3, 3, 3)) for r in draws])
-    factors = torch.from_numpy(fields).float().to(images.device).exp()
+    fields = []
+    for index in indices.tolist():
+        random = np.random.default_rng((step, index))
+        fields.append(spread * random.uniform() * random.normal(size=(3, 3, 3)))
+    factors = torch.from_numpy(np.stack(fields)).float().to(images.device).exp()
     light = F.interpolate(factors, images.shape[-2:], mode="bilinear", align_corners=True)
     return (images * light).round_().clamp_(0, 255).to(torch.uint8)
 
