@@ -7,9 +7,10 @@ drafts is given, or read from a published table. Nothing is run, and this module
 from __future__ import annotations
 
 import csv
+import functools
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -87,7 +88,6 @@ class Decodes:
     profile: Profile
     tokens: int
     drafts: Drafts
-    _known: dict[tuple[str, int], float] = field(default_factory=dict, repr=False)
 
     def seconds(self, acceptance: Sequence[float]) -> float:
         """Return the mean seconds of a decode, verified or not; for the argument see `verified`."""
@@ -127,11 +127,10 @@ class Decodes:
             return None
         return self.verified([_least(lambda chance: self.verified([chance]).seconds <= limit)])
 
-    def _cost(self, kind: str, rows: int) -> float:
-        """Return `Profile.seconds`, which a search asks for again and again."""
-        if (kind, rows) not in self._known:
-            self._known[kind, rows] = self.profile.seconds(kind, rows)
-        return self._known[kind, rows]
+    @functools.cached_property
+    def _cost(self) -> Callable[[str, int], float]:
+        """`Profile.seconds`, which a search asks for again and again."""
+        return functools.cache(self.profile.seconds)
 
     @property
     def _source(self) -> float:

@@ -81,11 +81,6 @@ class Phase:
     floor: float
 
     @property
-    def share(self) -> float:
-        """Shortest possible time ÷ measured time (median). It is 1 if the phase is as fast as the device allows."""
-        return self.floor / self.seconds
-
-    @property
     def name(self) -> str:
         """Name of the phase in tables."""
         if self.kind == "verify":
@@ -93,9 +88,12 @@ class Phase:
         return f"{self.kind} {self.rows}" if self.kind in FORWARDS[1:] else self.kind
 
     def as_dict(self) -> dict[str, float | str]:
-        """Return the fields for JSON, and the phase's name, its share, and the GB/s and GFLOP/s that it reached."""
+        """Return the fields for JSON, and the phase's name, the GB/s and GFLOP/s that it reached, and its share.
+
+        The share is the shortest possible time ÷ the median: 1 if the phase is as fast as the device allows.
+        """
         rates = {"gb_per_s": self.read / self.seconds / 1e9, "gflop_per_s": self.flops / self.seconds / 1e9}
-        return {"name": self.name, **asdict(self), **rates, "share": self.share}
+        return {"name": self.name, **asdict(self), **rates, "share": self.floor / self.seconds}
 
 
 class Laps(Stopwatch):

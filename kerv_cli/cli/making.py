@@ -27,12 +27,13 @@ def as_planned(database: Database, plan: bool = False, as_json: bool = False) ->
         What the work calls once its settings are checked.
     """
     from kerv_cli.lab import runs
+    from kerv_cli.lab.command import current_command
 
     with ExitStack() as stack:
 
         def begin(kind: str, folder: Path, what: str, units: int) -> Stage:
             if plan:
-                end_with_plan(f"{what}, {runs.time_as_before(database, kind, units)}", as_json)
+                end_with_plan(f"{what}, {runs.time_of(database, kind, current_command(), units)}", as_json)
             run = stack.enter_context(runs.making(database, kind, folder))
             return lambda title: progress_bar(title, run)
 

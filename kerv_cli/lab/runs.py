@@ -134,11 +134,6 @@ def time_of(database: Database, kind: str, command: Sequence[str], units: int = 
     return about(scaled, f"at the speed of {kind}/{row.name}")
 
 
-def time_as_before(database: Database, kind: str, units: int = 0) -> str:
-    """Say how long the command that was typed will take, see `time_of`."""
-    return time_of(database, kind, current_command(), units)
-
-
 _SIZES = ("name", "task", "demos", "episodes", "seed", "train.steps", "results", "store", "policy.target")
 """Settings in which two commands may differ although they work at the same speed."""
 

@@ -74,14 +74,8 @@ EPISODE_BYTES, FEW_EPISODES = 1024, 500
 """Least size of an episode in its file, in bytes, and the number of episodes of which any file may hold."""
 _MOST_REWINDS = 10  # of a data file whose episodes are not in order
 _MEMORY = 3 * 2**29  # bytes, beyond what the process has
-_DAMAGE = (
-    OSError,
-    ValueError,
-    KeyError,
-    TypeError,
-    SyntaxError,
-    Image.DecompressionBombError,
-)  # PIL raises SyntaxError
+# PIL raises SyntaxError
+_DAMAGE = (OSError, ValueError, KeyError, TypeError, SyntaxError, Image.DecompressionBombError)
 _TEMPLATE = re.compile(r"([^{}]|\{video_key\}|\{(chunk|file)_index(:0?\d{1,2}d)?\}){1,1000}")
 
 OPENVLA = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
