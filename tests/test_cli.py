@@ -382,6 +382,10 @@ ANSWERS = [
         "calibrate success",
         "is there, as a part of a shipped policy: policy.artifacts.certificate=NAME makes one of yours",
     ),
+    (
+        "build drafter checkpoint=published",
+        "is there, as a part of a shipped policy: policy.artifacts.drafter=NAME makes one of yours",
+    ),
     ("serve method=heisd", "its calibration or drafts differ between tasks: name one with task=NAME"),
     ("serve method=spec_vla proposer=retrieval task=rech", "unknown task 'rech': did you mean reach-v3?"),
     ("serve policy=expert", "policy=expert: it needs the simulator and cannot be served"),

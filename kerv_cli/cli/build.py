@@ -50,6 +50,8 @@ def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
 )
 def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
     """Import a drafter in the public EAGLE or Spec-VLA layout for a target."""
+    if not settings.checkpoint:
+        raise UsageError("checkpoint=DIR: name the folder of a drafter (config.json, model.safetensors)")
     from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import making
     from kerv_cli.methods.artifacts import Artifacts

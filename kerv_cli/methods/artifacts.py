@@ -23,7 +23,7 @@ from kerv_cli.engine.protocol import Target
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets import checkpoint
 from kerv_cli.targets.checkpoint import TargetDescription
-from kerv_cli.targets.folders import beside, find_target
+from kerv_cli.targets.folders import beside, check_not_shipped, find_target
 
 TARGET = "target"
 
@@ -270,17 +270,24 @@ class Artifacts:
         beside = Path(self.description.origin.get("base", self.folder))
         return kind_of(kind).path(self.results, self.policy.artifacts.get(kind), beside)
 
-    def new(self, kind: str) -> Path:
+    def new(self, kind: str, adds: bool = False) -> Path:
         """Return the path to write the policy's artifact of this kind to.
+
+        Args:
+            kind: Kind of the artifact.
+            adds: Whether the command only adds to an artifact that is there, so that it may be a shipped policy's.
 
         Raises:
             UsageError: `policy.artifacts.KIND` is a path. A command writes only to the results folder, or to the folder
-                beside the target.
+                beside the target. Or an artifact of a shipped policy would be replaced.
         """
         name = self.policy.artifacts.get(kind)
         if name:
             check_name(name, f"policy.artifacts.{kind}:")
-        return self.path(kind)
+        path = self.path(kind)
+        if not adds:
+            check_not_shipped(path, f"policy.artifacts.{kind}")
+        return path
 
     def exists(self, kind: str) -> bool:
         """Return whether the policy has an artifact of this kind."""

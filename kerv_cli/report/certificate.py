@@ -34,7 +34,7 @@ from kerv_cli.methods.certified.certificate import Attempt, Candidate, Certifica
 from kerv_cli.methods.compose import Method
 from kerv_cli.report.measures import paired
 from kerv_cli.report.tables import load_study
-from kerv_cli.targets.folders import beside, check_not_shipped
+from kerv_cli.targets.folders import beside
 from kerv_cli.targets.provenance import provenance
 from kerv_cli.training.settings import CalibrateSuccessSettings
 from kerv_cli.worlds import resolve_tasks, spec_of
@@ -65,9 +65,7 @@ def folder_of(resolved: ResolvedStudy) -> Path:
     first, tasks = candidates[0], resolve_tasks(baseline.task)
     seeds = range(first.seed, first.seed + first.episodes)
     spec_of(tasks[0]).seeds.check(seeds, "selection", f"seed={first.seed}")
-    folder = artifacts_of(first).new(CertificateArtifact.kind)
-    check_not_shipped(folder, "policy.artifacts.certificate")
-    return folder
+    return artifacts_of(first).new(CertificateArtifact.kind)
 
 
 def _check_conditions(resolved: ResolvedStudy) -> None:

@@ -41,7 +41,6 @@ from kerv_cli.methods.compose import Method
 from kerv_cli.methods.heisd.curvature import BoundaryRanges
 from kerv_cli.methods.heisd.datastore import Datastore
 from kerv_cli.methods.kerv.prediction import FILTERS, Noise, kalman_weights
-from kerv_cli.targets.folders import check_not_shipped
 from kerv_cli.targets.observations import check_tail, observations_of
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_tasks, demos_for
@@ -104,7 +103,6 @@ def calibrate(
     target.check_autoregressive("kerv calibrate", "there is no draft to calibrate")
     settings, dataset = demos_for(settings, target, database)
     tasks = resolve_tasks(settings.task or list(dataset.manifest.tasks))
-    path = artifacts.new("calibration")
     chosen = choose_episodes(dataset, tasks, settings.episodes)
     method = Method.of(RolloutSettings(**{kind: find(kind, name).default for kind, name in DRAFTS.items()}))
     no_drafter = [kind for kind in method.needs if not artifacts.exists(kind)]
@@ -115,9 +113,9 @@ def calibrate(
         missing.append("datastore")
     old: Calibration | None = artifacts.load("calibration") if settings.complete else None
     # a shipped calibration may be completed, and skip levels may be added to it
-    has_skip = not path.is_file() or read_mapping(path).get("skip") is not None
-    if old is None and ("datastore" in missing or has_skip):
-        check_not_shipped(path, "policy.artifacts.calibration")
+    path = artifacts.path("calibration")
+    lacks_skip = "datastore" not in missing and path.is_file() and read_mapping(path).get("skip") is None
+    artifacts.new("calibration", adds=old is not None or lacks_skip)
     without = f"; without {' and '.join(missing)}" if missing else ""
     plan = (
         f"predictors fitted on {count(len(chosen), 'demonstration')} of {count(len(tasks), 'task')}; "

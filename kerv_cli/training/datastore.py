@@ -33,7 +33,6 @@ from kerv_cli.methods.heisd.datastore import (
     projected,
     prompt_key,
 )
-from kerv_cli.targets.folders import check_not_shipped
 from kerv_cli.targets.observations import observations_of, observed_steps, prompts_of, read_chunks
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import demos_for
@@ -75,7 +74,6 @@ def build_datastore(
     settings, dataset = demos_for(settings, artifacts.description, database)
     tasks = sorted(resolve_tasks(settings.task or list(dataset.manifest.tasks)))
     folder = artifacts.new("datastore")
-    check_not_shipped(folder, "policy.artifacts.datastore")
     is_store = (folder / MANIFEST).is_file() and read_mapping(folder / MANIFEST).get("kind") == "datastore"
     if not is_store and (folder.is_file() or visible(folder)):
         raise UsageError(f"{folder} exists and is no datastore: give the new one another name")

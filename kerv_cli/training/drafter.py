@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import set_up
 from kerv_cli.lab.database import Database
@@ -19,7 +18,6 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import EagleDrafter
 from kerv_cli.methods.eagle.public import Convention, PublicDrafter, read_public
 from kerv_cli.targets.checkpoint import load_target
-from kerv_cli.targets.folders import check_not_shipped
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_tasks, demos_for
 from kerv_cli.training.fit import Metrics, batches, fit, without_subnormals
@@ -54,7 +52,6 @@ def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Beg
     drafter, train = drafter_of(settings), settings.train
     artifacts = Artifacts(settings.results, settings.policy)
     folder, description = artifacts.new(drafter.kind), artifacts.description
-    check_not_shipped(folder, f"policy.artifacts.{drafter.kind}")
     description.check_autoregressive(
         f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
     )
@@ -121,11 +118,9 @@ def import_drafter(settings: BuildDrafterSettings) -> tuple[Path, dict[str, Any]
         The drafter's folder, and numbers to print: parameters, layers, positions and mask.
 
     Raises:
-        UsageError: `checkpoint` is empty.
+        UsageError: The drafter of a shipped policy would be replaced.
         CheckpointError: The target does not exist. Or the drafter is incomplete, damaged, pickled or of another width.
     """
-    if not settings.checkpoint:
-        raise UsageError("checkpoint=DIR: name the folder of a drafter (config.json, model.safetensors)")
     convention = Convention(settings.positions, settings.mask)
     device, _ = set_up(settings.runtime)
     artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
