@@ -12,8 +12,8 @@ import numpy as np
 from kerv_cli.base.errors import UsageError
 from kerv_cli.bench.expected import Decodes, Drafts
 from kerv_cli.bench.prices import Costs, check_tokens
+from kerv_cli.bench.trace import TracedDecode, grouped, work_of_trace
 from kerv_cli.engine.cost import prices
-from kerv_cli.engine.trace import TracedDecode, grouped, work_of_trace
 
 _RESAMPLES = 200
 _SEED = 0

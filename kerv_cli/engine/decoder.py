@@ -42,11 +42,9 @@ class Parts:
 
     def similarity(self, chunk: Chunk) -> float | None:
         """Return the cosine of the best match in the datastore. None if no part searched it for this chunk."""
-        for part in (self.skip, self.prefill_draft, self.proposer):
-            found = None if part is None else part.similarity(chunk)
-            if found is not None:
-                return found
-        return None
+        parts = filter(None, (self.skip, self.prefill_draft, self.proposer))
+        found = [part.similarity(chunk) for part in parts]
+        return next((one for one in found if one is not None), None)
 
 
 class Verified(NamedTuple):
