@@ -22,7 +22,6 @@ from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.artifacts import Use
 from kerv_cli.methods.certified import CertifiedSkipSettings, ScopedSettings, certified, scoped
-from kerv_cli.methods.certified.betting import p_value, wealth
 from kerv_cli.methods.certified.certificate import Candidate, Certificate, CertificateArtifact
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.merged import MergedProposerSettings
@@ -30,6 +29,7 @@ from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.methods.scout.drafter import ScoutDrafter, ScoutNetwork, ScoutProposer, check_sees
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.methods.streak import AlwaysSkip, StreakSkip, StreakSkipSettings
+from kerv_cli.report.betting import p_value, wealth
 from kerv_cli.report.certificate import folder_of
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.compilable import compile_parts

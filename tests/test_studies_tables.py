@@ -22,7 +22,6 @@ from studies_synthetic import part, points_of, settings_of, still_episode, study
 
 from kerv_cli.base.config import groups
 from kerv_cli.engine.record import DecodeRecord, Round
-from kerv_cli.engine.tally import Tally
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab import database as tables
 from kerv_cli.lab.database import opened
@@ -37,6 +36,7 @@ from kerv_cli.report.results import MACRO, MICRO, Result, averaged, frame_of
 from kerv_cli.report.statistics import PairedCounts, mean_of, paired_difference, speedup, wilson
 from kerv_cli.report.summary import SummaryTable, not_in_turn, of_runs, summary_frame
 from kerv_cli.report.tables import StudyData, further_of, load_study
+from kerv_cli.report.tally import Tally
 
 PREFILL = Round("prefill", "none", 0, (), (1,), 0, 1, 0, ())
 

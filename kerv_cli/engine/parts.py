@@ -32,6 +32,10 @@ class Buildable(ABC):  # noqa: B024 - its subclasses are the interfaces
         """Return the part that these settings choose; arguments as the constructor. None: the method needs no part."""
         return cls(settings, context)
 
+    def similarity(self, chunk: Chunk) -> float | None:
+        """Return the cosine of the best match in the datastore. None if it was not searched for this chunk."""
+        return None
+
 
 class Threshold(Buildable):
     """Chooses the acceptance radius r of every decode (docs/methods.md §3.2).
@@ -60,6 +64,16 @@ class Fixed(Threshold):
 
     def __init__(self, r: int) -> None:
         self.r = r
+
+    @classmethod
+    def build(cls, settings: Any, context: Any) -> Fixed:
+        """Build the threshold with the radius `settings.r`.
+
+        Raises:
+            UsageError: The radius is larger than the distance of any two tokens.
+        """
+        context.check_radius("r", settings.r)
+        return cls(settings.r)
 
     def radius(self) -> int:
         """Return the constant radius r, in bins."""
@@ -121,10 +135,6 @@ class Skip(Buildable):
     @abstractmethod
     def take(self, chunk: Chunk) -> SkipDecision:
         """Decide about a chunk before the target runs."""
-
-    def similarity(self, chunk: Chunk) -> float | None:
-        """Return the cosine of the best match in the datastore, as `Proposer.similarity`."""
-        return None
 
     def verified(self, chunk: Chunk) -> None:
         """Learn how the target judged the prefill draft.

@@ -32,10 +32,6 @@ class Proposer(Buildable):
     def begin(self, chunk: Chunk) -> None:
         """Begin a chunk. Called after its prefill has committed the first tokens."""
 
-    def similarity(self, chunk: Chunk) -> float | None:
-        """Return the cosine of the best match in the datastore. None if it was not searched for this chunk."""
-        return None
-
     @abstractmethod
     def propose(self, chunk: Chunk, depth: int) -> Draft:
         """Return a draft with at most `depth` tokens on any path. It may be empty."""

@@ -57,16 +57,4 @@ class FixedThresholdSettings:
     r: int = number(9, 0, MOST_BINS)  # largest accepted distance to the target's token, bins
 
 
-@ThresholdPart("fixed", FixedThresholdSettings, batchable=True)
-class FixedThreshold(Fixed):
-    """The part that the setting `threshold=fixed` chooses."""
-
-    @classmethod
-    def build(cls, settings: FixedThresholdSettings, context: Context) -> FixedThreshold:
-        """Build the threshold.
-
-        Raises:
-            UsageError: The radius is larger than the distance of any two tokens.
-        """
-        context.check_radius("r", settings.r)
-        return cls(settings.r)
+ThresholdPart("fixed", FixedThresholdSettings, batchable=True)(Fixed)

@@ -29,9 +29,9 @@ from kerv_cli.episodes.settings import WAITS, RolloutSettings
 from kerv_cli.lab.database import SETTINGS, STUDIES, WANTED, now
 from kerv_cli.lab.plan import Episode, seeds_text
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.methods.certified.betting import p_value
 from kerv_cli.methods.certified.certificate import Attempt, Candidate, Certificate, CertificateArtifact
 from kerv_cli.methods.compose import Method
+from kerv_cli.report.betting import p_value
 from kerv_cli.report.measures import paired
 from kerv_cli.report.tables import load_study
 from kerv_cli.targets.folders import beside

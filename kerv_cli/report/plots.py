@@ -21,10 +21,10 @@ from PIL import Image
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import write_if_changed
-from kerv_cli.engine.tally import Tally
 from kerv_cli.report.results import Result, averaged, frame_of, is_number
 from kerv_cli.report.summary import MAIN, summary_frame
 from kerv_cli.report.tables import NO_STRESS, is_stressed, latency_table
+from kerv_cli.report.tally import Tally
 
 INK, MUTED, BLUE, GREEN = "#1f2933", "#6b7785", "#0b6fb8", "#2a9d6f"
 COLOURS = (BLUE, "#d1495b", GREEN, "#8d5fd3", "#e08e1b", "#3aa6b9", "#7a5c3e")  # distinct when colour-blind

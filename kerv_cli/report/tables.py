@@ -16,7 +16,6 @@ import pandas as pd
 import pyarrow.compute as pc
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.engine.tally import Tally
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, flat, stress_of, without
 from kerv_cli.lab.plan import Episode, Setting, Study, seeds_text
 from kerv_cli.lab.store import StudyStore
@@ -25,6 +24,7 @@ from kerv_cli.report.decide import with_matched_speed
 from kerv_cli.report.measures import Speeds, compared, measure, paired, speedups
 from kerv_cli.report.results import MACRO, MICRO, Result, Row, averaged, columns_of, frame_of, is_number
 from kerv_cli.report.statistics import PairedCounts
+from kerv_cli.report.tally import Tally
 from kerv_cli.targets.provenance import PACKAGES
 from kerv_cli.worlds import specs
 

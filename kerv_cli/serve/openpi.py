@@ -13,7 +13,7 @@ import numpy as np
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.tally import Tally
+from kerv_cli.report.tally import Tally
 from kerv_cli.serve.interface import Interface, Message, hand_of, keys_of, packed, text_of, unpacked
 from kerv_cli.serve.policy import Conversation, Log, Policy
 
