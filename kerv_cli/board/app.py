@@ -86,6 +86,7 @@ def make_app(database: Database) -> Starlette:
         exception_handlers=dict.fromkeys((KervError, HTTPException, Exception), _failed),
     )
     app.state.database = database
+    app.state.only = frozenset()  # ids of the runs to list; empty: all
     return app
 
 

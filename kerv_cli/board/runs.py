@@ -39,7 +39,8 @@ def show_runs(request: Request) -> Response:
     if request.query_params.get("known") == version:
         return Response(status_code=204)  # htmx leaves the page as it is
     asked = {name: request.query_params.get(name, "") for name in ("kind", "state", "text", "sort")}
-    every = find_runs(database_of(request))
+    only = request.app.state.only
+    every = [run for run in find_runs(database_of(request)) if not only or run.id in only]
     kinds = Counter(run.kind for run in every)
     runs = [run for run in every if _agrees(run, asked)]
     order = asked["sort"].removeprefix("-")

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import typer
 
+from kerv_cli.base.durations import count
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import number, setting
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import end_at_once
+from kerv_cli.cli.common import AsJson, end_at_once, end_with_json
+
+BOARD_FILE = "static/board.css"
+"""File of every exported board. A folder that has it is replaced."""
 
 
 @dataclass(kw_only=True)
@@ -40,3 +46,30 @@ def board(settings: BoardSettings) -> None:
         settings.open and has_display(),
     )
     end_at_once()
+
+
+@command(
+    "board export",
+    names="NAME: a folder to write to, then runs (id, or a unique part of it; none: all), and results=DIR.",
+    keys="results",
+    examples=("kerv board export shared", "kerv board export shared papers"),
+    writes=False,
+)
+def export(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
+    """Write the board as files: tables, plots, films, tokens. They open without a server and can be sent."""
+    from kerv_cli.base.files import write_folder
+    from kerv_cli.board.export import export_board
+    from kerv_cli.catalogue.entries import find_run
+    from kerv_cli.lab.database import opened
+
+    if not names:
+        raise UsageError("name a folder to write to, as in 'kerv board export shared'")
+    folder, database, files = Path(names[0]).expanduser(), opened(settings.results), list[Path]()
+    if folder.exists() and not (folder / BOARD_FILE).is_file() and (not folder.is_dir() or any(folder.iterdir())):
+        raise UsageError(f"{folder} holds other files: name another folder")
+    runs = [find_run(database, name).id for name in names[1:]]
+    write_folder(folder, lambda new: files.extend(export_board(database, runs, new)))
+    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    if as_json:
+        end_with_json({"folder": folder, "files": len(files), "bytes": size})
+    typer.echo(f"{count(len(files), 'file')}, {size / 1e6:.1f} MB: open {folder / 'index.html'}")
