@@ -50,10 +50,11 @@ def artifact() -> type:
 
 
 class Index(ABC):
-    """A search for stored rows with keys most similar to a given key. The rows found are then ranked exactly.
+    """A search for stored rows with keys most similar to a given key. The rows found are then ranked exactly."""
 
-    Its constructor takes the `Datastore` and the settings of the search.
-    """
+    def __init__(self, store: Datastore, settings: Any) -> None:
+        """Keep the datastore; `settings` are those of the search."""
+        self.store = store
 
     @abstractmethod
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:

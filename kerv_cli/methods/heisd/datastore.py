@@ -169,9 +169,6 @@ def best(vectors: np.ndarray, rows: np.ndarray, key: np.ndarray, k: int) -> tupl
 class ExactIndex(Index):
     """datastore=exact, the default: compare the key with all entries of the task, in this process."""
 
-    def __init__(self, store: Datastore, settings: object) -> None:
-        self.store = store
-
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
         """Return the k most similar rows, and all rows within rounding errors of the k-th; see `Index.candidates`."""
         shard = self.store.shards[task]
