@@ -1,4 +1,4 @@
-"""Compare two runs (`kerv compare`): which settings differ, and how their results differ."""
+"""Compare two runs (`kerv runs compare`): which settings differ, and how their results differ."""
 
 from __future__ import annotations
 
