@@ -96,11 +96,6 @@ class Evaluation:
         return dict(self.server.get("kerv") or {})
 
     @property
-    def worlds(self) -> set[tuple[str, int]]:
-        """Task and seed of every recorded episode."""
-        return {(one.task, one.seed) for one in self.episodes}
-
-    @property
     def name(self) -> str:
         """The decoding method, if kerv served the policy; otherwise the name of the model server."""
         method = self.facts.get("settings", {}).get("method")
@@ -247,7 +242,8 @@ def _check_same_episodes(names: str, first: Sequence[Evaluation], other: Sequenc
                 raise UsageError(
                     f"{names} have different episodes of {benchmark}: {key} is {left.get(key)} and {right.get(key)}"
                 )
-        has_pairs |= not a.worlds.isdisjoint(b.worlds)
+        worlds = {(one.task, one.seed) for one in a.episodes}
+        has_pairs |= any((one.task, one.seed) in worlds for one in b.episodes)
     if not has_pairs:
         raise UsageError(f"{names} have no episode in common: neither task nor seed agree")
 

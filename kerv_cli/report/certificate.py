@@ -280,17 +280,11 @@ def candidate_rows(certificate: Certificate) -> list[dict[str, str]]:
     """Return the table of candidates to print: one dictionary of column to text per candidate."""
     rows = []
     for one in certificate.candidates:
-        cells = {
-            "setting": one.label,
-            "success": f"{one.successes}/{one.pairs}",
-            "success of AR": f"{one.ar}/{one.pairs}",
-            "lost / won": f"{one.lost} / {one.won}",
-        }
-        if one.p is None:
-            cells |= {"p": "not tested", "certified": ""}
-        else:
-            cells |= {"p": f"{one.p:.3g}", "certified": "yes" if one.p <= certificate.delta else "no"}
-        rows.append(cells)
+        test = {"p": "not tested", "certified": ""}
+        if one.p is not None:
+            test = {"p": f"{one.p:.3g}", "certified": "yes" if one.p <= certificate.delta else "no"}
+        success = {"success": f"{one.successes}/{one.pairs}", "success of AR": f"{one.ar}/{one.pairs}"}
+        rows.append({"setting": one.label, **success, "lost / won": f"{one.lost} / {one.won}", **test})
     return rows
 
 
