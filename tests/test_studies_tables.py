@@ -32,10 +32,10 @@ from kerv_cli.report.glossary import METHODS, UNVERIFIED, WORDS, explained
 from kerv_cli.report.page import render
 from kerv_cli.report.plots import acceptance_figure, curves_figure, png, study_figures, with_lines
 from kerv_cli.report.report import Unpublishable, refusals, report
-from kerv_cli.report.results import MACRO, MICRO, Result, averaged, frame_of
+from kerv_cli.report.results import MACRO, MICRO, Result, averaged, columns_of, frame_of
 from kerv_cli.report.statistics import PairedCounts, mean_of, paired_difference, speedup, wilson
 from kerv_cli.report.summary import SummaryTable, not_in_turn, of_runs, summary_frame
-from kerv_cli.report.tables import StudyData, further_of, load_study
+from kerv_cli.report.tables import CSV_COLUMNS, StudyData, further_of, load_study
 from kerv_cli.report.tally import Tally
 
 PREFILL = Round("prefill", "none", 0, (), (1,), 0, 1, 0, ())
@@ -192,6 +192,17 @@ def test_one_task_by_hand(data):
     assert {name: row[name] for name in expected} == pytest.approx(expected)
     found = speedup(np.array([0.5, 0.3]), np.array([0.25, 0.05]), ["reach", "reach"])
     assert (row["speedup_low"], row["speedup_high"]) == pytest.approx((found.low, found.high))
+
+
+def test_the_columns_of_a_row_are_the_fields_of_its_result(data):
+    (result,) = (row for row in data.results if row.label == "kerv" and row.averaging == MACRO)
+    columns = columns_of(vars(result))
+    found = result.measures
+    assert set(CSV_COLUMNS) <= set(columns)
+    assert tuple(columns[f"difference{end}"] for end in ("", "_low", "_high")) == found.difference
+    assert (columns["pairs"], columns["only_baseline"]) == (found.pairs, found.counts.only_baseline) == (5, 1)
+    assert columns["ms.prefill"] == found.phases["ms.prefill"]
+    assert (columns["threshold.r"], columns["baseline"]) == (result.settings["threshold.r"], "ar")
 
 
 def test_failures_near_the_object_are_a_share_of_the_failures(data):
