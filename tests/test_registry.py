@@ -57,6 +57,16 @@ def shelf(monkeypatch):
 EVERY = [(kind, name) for kind in kinds() for name, part in parts(kind).items() if "examples." not in part.module]
 
 
+def test_parts_have_one_order_whichever_family_is_imported_first():
+    """It is the order of drafters in `kerv prepare`, of costs in a profile and of choices in a help text."""
+    script = (
+        "from kerv_cli.base.registry import kinds, parts; print([(kind, *parts(kind)) for kind in sorted(kinds())])"
+    )
+    begin = "import kerv_cli.methods.heisd; "
+    first, other = (process("-c", start + script, KERV_PLUGINS="").stdout for start in ("", begin))
+    assert first == other != ""
+
+
 def test_a_name_belongs_to_one_piece_of_code(shelf):
     ProposerPart("mine", when=PREFILL)(StreakSkip)
     ProposerPart("mine", colour=1, when=PREFILL)(StreakSkip)

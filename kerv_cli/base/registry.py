@@ -394,8 +394,20 @@ def _load_all() -> None:
 
 @functools.cache
 def _load(kind: str) -> None:
-    for name in MODULES.get(kind, [f"kerv_cli.methods.{family}" for family in FAMILIES.split()]):
+    """Import the modules that register a kind. Families come in their order, whichever was imported first."""
+    modules = MODULES.get(kind, [f"kerv_cli.methods.{family}" for family in FAMILIES.split()])
+    for name in modules:
         importlib.import_module(name)
+    if kind in MODULES or kind not in _PARTS:
+        return
+
+    def rank(part: Part) -> int:
+        family = ".".join(part.module.split(".")[:3])
+        if family in modules:
+            return modules.index(family)
+        return -1 if part.absent or family.startswith("kerv_cli.") else len(modules)
+
+    _PARTS[kind] = dict(sorted(_PARTS[kind].items(), key=lambda item: rank(item[1])))
 
 
 @functools.cache
