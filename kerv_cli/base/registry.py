@@ -32,10 +32,7 @@ MODULES: Mapping[str, Sequence[str]] = {
     "stress": ("kerv_cli.worlds.stress.kinds",),
     "target": ("kerv_cli.targets",),
 }
-"""The modules that register kerv's own parts of a kind."""
-
-FAMILIES = "ar spec_vla eagle early scout calibrated kerv parallel streak sp_vla contact heisd jacobi merged certified"
-"""The modules of `kerv_cli.methods` that register all other kinds of parts."""
+"""The modules that register kerv's own parts of a kind. `kerv_cli.methods` registers those of all other kinds."""
 
 METHOD_KINDS = ("prefill_draft", "proposer", "acceptance", "threshold", "rectifier", "boundary", "skip")
 """The parts of a method, in the order in which a decode uses them."""
@@ -394,20 +391,8 @@ def _load_all() -> None:
 
 @functools.cache
 def _load(kind: str) -> None:
-    """Import the modules that register a kind. Families come in their order, whichever was imported first."""
-    modules = MODULES.get(kind, [f"kerv_cli.methods.{family}" for family in FAMILIES.split()])
-    for name in modules:
+    for name in MODULES.get(kind, ("kerv_cli.methods",)):
         importlib.import_module(name)
-    if kind in MODULES or kind not in _PARTS:
-        return
-
-    def rank(part: Part) -> int:
-        family = ".".join(part.module.split(".")[:3])
-        if family in modules:
-            return modules.index(family)
-        return -1 if part.absent or family.startswith("kerv_cli.") else len(modules)
-
-    _PARTS[kind] = dict(sorted(_PARTS[kind].items(), key=lambda item: rank(item[1])))
 
 
 @functools.cache

@@ -21,3 +21,10 @@ which is imported when the part is built.
 `artifacts.py` finds, checks and loads files. `drafters.py` is the base of drafters with weights. `calibration.py` is
 the file of calibrated numbers that KERV and HeiSD share.
 """
+
+from __future__ import annotations
+
+# importing a family registers its parts; this is their order in error messages and help texts
+# isort: off
+from kerv_cli.methods import ar, spec_vla, eagle, early, scout, calibrated, kerv, parallel, streak  # noqa: F401
+from kerv_cli.methods import sp_vla, contact, heisd, jacobi, merged, certified  # noqa: F401
