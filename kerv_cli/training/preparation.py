@@ -108,10 +108,9 @@ def needs(methods: tuple[str, ...], sees: bool, runnable: bool = True) -> tuple[
         kinds -= seeing
     if not runnable:
         kinds -= set(studies)
-    drafters = [kind for kind in artifacts if isinstance(kind_of(kind), TrainableDrafter)]
     order: list[str] = []
-    for kind in (*drafters, *artifacts):
-        order += [*artifacts[kind].needed(None), kind]
+    for kind, part in artifacts.items():
+        order += [*part.needed(None), kind]
     return tuple(kind for kind in dict.fromkeys(order) if kind in kinds and kind_of(kind).command)
 
 
