@@ -194,7 +194,7 @@ def test_the_help_of_a_command_shows_its_settings_and_two_examples_that_compose(
 
 def test_a_sweep_without_a_study_lists_the_studies_with_their_sizes(tmp_path):
     shown = kerv("sweep", f"results={tmp_path}")
-    assert re.search(r"\bdemo +│( +\d+ +│){4} The three papers", shown.stdout)
+    assert re.search(r"\bdemo +│( +\d+ +│){4} README's table", shown.stdout)
     assert list(tmp_path.iterdir()) == []
     listed = {row["study"]: row for row in json.loads(kerv("sweep", "--json").stdout)}
     assert set(listed) == set(groups()["study"])
