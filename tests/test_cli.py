@@ -76,7 +76,7 @@ def test_help_and_mistakes_are_fast(words, most, times, environment, tmp_path):
     asked = ("-W", "ignore", "-c", run, *words)
     if seconds(*asked) > most:  # a loaded machine is judged against the import of typer alone
         typer = min(seconds("-c", "import typer") for _ in range(3))
-        assert min(seconds(*asked) for _ in range(5)) < max(most, times * typer)
+        assert any(seconds(*asked) < max(most, times * typer) for _ in range(5))
 
 
 EVERY_COMMAND = """
