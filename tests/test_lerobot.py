@@ -184,7 +184,7 @@ def edited(results: Path, tmp_path: Path, **changes: Any) -> Path:
     [
         ({}, ["source="], "source=DIR"),
         ({}, ["source=meta"], "of a LeRobot dataset of version 3"),
-        ({"codebase_version": "v2.1"}, [], "v2.1"),
+        ({"codebase_version": "v2.1"}, [], "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id="),
         ({"features": {"action": {"dtype": "float32", "shape": [7]}}}, [], "no images"),
         ({}, ["camera=side"], "unknown camera 'side': known: front"),
         ({}, ["strict=[jaw]"], "unknown strict DoF 'jaw'"),

@@ -234,6 +234,11 @@ def test_a_server_that_cannot_start_says_so(policies):
     words = ("serve", "policy.target=nano-vision", f"results={policies}")
     assert "no early drafter in" in refusal(*words, "method=one_pass", code=1)
     assert "cannot listen on 256.1.1.1:0" in refusal(*words, "host=256.1.1.1", "port=0")
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        busy = refusal(*words, "host=127.0.0.1", f"port={taken.getsockname()[1]}", code=2)
+    assert busy.endswith("port=0 takes a free one")
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
