@@ -312,11 +312,11 @@ def encoder_of(towers: Sequence[Tower], width: int) -> Needs:
 
 
 def encoder_of_weights(weights: float, tokens: int) -> Needs:
-    """Return what an encoder of so many weights needs.
+    """Return what a vision encoder of a given size reads and computes.
 
     Args:
-        weights: Number of weights, each of which is used once per token. 0: there is no encoder.
-        tokens: Number of tokens that it makes.
+        weights: Number of weights. Each is used once per token. 0: there is no encoder.
+        tokens: Number of tokens that the encoder makes.
     """
     blocks = 0 if not weights else 27 if weights > 200e6 else 12  # SigLIP So400m's and ViT-B's
     return Needs(_HALF * weights, 2.0 * weights * tokens, blocks=blocks, kernels=_ENCODER * bool(weights), asks=True)

@@ -204,11 +204,11 @@ class Anchor:
 
     Attributes:
         device: Name in `DEVICES`.
-        engine: The engine, or `ROOFLINE`.
+        engine: The engine that was timed. `ROOFLINE`: the source computed the shortest possible time.
         low: Shortest published time, milliseconds.
         high: Longest published time, milliseconds.
         source: Who published it.
-        weight: Bytes of a weight of the language model.
+        weight: Bytes per weight of the language model.
     """
 
     device: str

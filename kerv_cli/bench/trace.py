@@ -144,7 +144,12 @@ def grouped(decodes: Sequence[TracedDecode]) -> Iterator[tuple[str, int, list[Tr
 
 
 def work_of_trace(decodes: Sequence[TracedDecode], tokens: int) -> Work:
-    """Return what decodes of `tokens` tokens computed: forwards, drafts, other seconds."""
+    """Count the forwards and drafts of some decodes, and sum their other seconds.
+
+    Args:
+        decodes: The decodes, all of the same chunk length.
+        tokens: N, number of tokens of a chunk.
+    """
     rounds: list[Mapping[str, str | int]] = []
     phases = {name: np.zeros(len(decodes)) for name in READ_PHASES}
     for number_, decode in enumerate(decodes):

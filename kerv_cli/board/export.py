@@ -1,7 +1,8 @@
 """Write the board's pages as files that a browser opens without a server, and that can be sent to a colleague.
 
-Every page is asked of the web app, as a browser does. Links lead to files; links to pages that are not exported become
-text. Elements with the attribute `data-live`, such as forms and buttons, are left out.
+The pages come from the web app: this module requests each of them as a browser would, without a network. Links lead to
+the written files. A link to a page that is not exported becomes plain text. Elements with the attribute `data-live`,
+such as forms and buttons, are left out.
 """
 
 from __future__ import annotations

@@ -205,14 +205,17 @@ def _evaluation(file: sqlite3.Connection, path: Path, name: str, metadata: str) 
 
 
 def labelled(recordings: Sequence[list[Evaluation]], labels: Sequence[str] = ()) -> dict[str, list[Evaluation]]:
-    """Return the evaluations of each path by a label. The evaluations of one label become one setting.
+    """Label each recording. Every label becomes one setting of the imported study.
 
     Args:
-        recordings: The evaluations of each path.
-        labels: A label for each path. Empty: the servers' names.
+        recordings: The evaluations in each recording.
+        labels: A label for each recording. Empty: the names of the model servers.
+
+    Returns:
+        The evaluations by label.
 
     Raises:
-        UsageError: The number of labels is wrong, or the evaluations have different episodes.
+        UsageError: The number of labels is wrong, two labels are equal, or the recordings have different episodes.
     """
     if labels and (len(labels) != len(recordings) or len(set(labels)) < len(labels)):
         raise UsageError(

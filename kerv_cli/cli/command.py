@@ -72,7 +72,10 @@ command = Command
 
 
 def schemas_of(part: Command) -> list[type]:
-    """Return the dataclass of a command's settings. If its attribute `each` names another command, add that one's."""
+    """Return the dataclasses of all settings that can be typed after a command.
+
+    The first one is the command's own. The second one belongs to the command that `each` names, if there is one.
+    """
     others = [Command.find(part.each)] if part.each else []
     return [one.settings for one in (part, *others)]
 

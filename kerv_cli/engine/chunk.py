@@ -245,12 +245,13 @@ class Chunk:
         return [*verification.target_tokens[: len(verification.drafted)], *rejection.target[: len(rejection.draft)]]
 
     def commit(self, record: Round, tokens: Sequence[int], rejection: Rejection | None = None) -> None:
-        """Commit the tokens that one forward decided.
+        """Commit the tokens that one forward of the target decided.
 
         Args:
-            record: What the forward verified, accepted and committed.
+            record: The record of this round.
             tokens: The tokens to commit.
-            rejection: The draft's and the target's tokens after a rejected token. None if no token was rejected.
+            rejection: What the draft and the target have after the rejected token, see `Rejection`. None if no token
+                was rejected.
         """
         self.forwards += 1
         self.tokens += tokens

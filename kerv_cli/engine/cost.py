@@ -48,11 +48,12 @@ def source_costs() -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class Profile:
-    """Measured seconds of every kind of forward and draft, depending on the number of rows (tokens) it processes.
+    """Seconds of every kind of forward and draft. They depend on how many rows (tokens) it processes.
 
     Attributes:
         prompt: Number of prompt tokens P.
-        phases: By kind of cost: the numbers of rows that were measured, increasing, and the seconds for each of them.
+        phases: Points of each kind of cost, as (rows, seconds). `rows` increases. `seconds[i]` is the time for
+            `rows[i]` rows.
         tokens: Number of tokens N in a chunk.
         about: What was measured: target, machine, versions.
     """

@@ -94,7 +94,10 @@ class Rectifier(Buildable):
         """Start a new episode."""
 
     def next_decode(self) -> None:
-        """Count a decode that has ended. A rectifier may pause for some decodes after it has predicted values."""
+        """Note that a decode has ended.
+
+        A rectifier that predicts nothing in the next few decodes after a prediction counts them here.
+        """
 
     @abstractmethod
     def rectify(self, chunk: Chunk) -> Rectified | None:

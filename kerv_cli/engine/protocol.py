@@ -160,7 +160,10 @@ class JoinsDrafters(Protocol):
         """
 
     def enlarge(self, drafter: nn.Module) -> None:
-        """Enlarge a drafter as the target was enlarged. Does nothing for any other target."""
+        """Enlarge a small policy's drafter in place, so that it fits this target.
+
+        Does nothing if this target was not made by enlarging a small policy (docs/methods.md §0.2).
+        """
 
 
 class ReadableTarget(Target, Protocol):

@@ -1,5 +1,6 @@
-"""The row of a study's table, from which CSV, JSON, terminal, page, board and verdict are made.
+"""The results of one setting of a study. Each is a row of the study's table.
 
+CSV and JSON files, the terminal, the page, the board and the verdict all show these rows.
 docs/methods.md §7 explains the measures.
 """
 

@@ -302,12 +302,12 @@ def described(folder: Path, kind: str, schema: type[T]) -> T:
 
 
 def check_weights(folder: Path, kind: str, sha256: str) -> None:
-    """Check that the weights in a folder have a hash.
+    """Check that the weights in a folder are those that its description names.
 
     Args:
         folder: Folder of the artifact.
         kind: Kind of artifact, for the error message.
-        sha256: The expected hash.
+        sha256: The hash in the description.
 
     Raises:
         CheckpointError: The weights are missing, or have a different hash.

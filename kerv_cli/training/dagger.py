@@ -76,7 +76,9 @@ class PolicyActor:
 
 @dataclass(frozen=True)
 class PolicyActs:
-    """Makes the `PolicyActor` of a recording, inside the process that records.
+    """A function that makes the `PolicyActor` of a recording. The process that records calls it.
+
+    It holds the settings and a hash, but no weights.
 
     Attributes:
         settings: Settings of the recording.

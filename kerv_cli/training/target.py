@@ -110,10 +110,10 @@ def train_target(settings: TrainTargetSettings, database: Database, begin: Begin
 
 
 def refuse_contradictions(settings: TrainTargetSettings) -> None:
-    """Refuse a number format other than float32, and images of another size than the policy would be shown.
+    """Check the number format and the image size of a training.
 
     Raises:
-        UsageError: One of the two is set.
+        UsageError: `runtime.dtype` is not float32, or the policy's image size differs from the camera's.
     """
     shown, dtype = settings.world.camera.size, settings.runtime.dtype
     if dtype != "float32":

@@ -73,7 +73,7 @@ class Attempt:
         margin: Percentage points of success that may be lost.
         delta: Level of the test: an upper bound of the probability that it certifies falsely.
         pairs: Number of pairs of episodes.
-        certified: Label of the boldest certified candidate. Empty if none was certified.
+        certified: Label of the last candidate in `order` that was certified. Empty if none was.
     """
 
     made: str
@@ -113,7 +113,7 @@ class Certificate:
         delta: Level of this test: an upper bound of the probability that it certifies falsely.
         seeds: Seeds of the test episodes, as text such as `1000-1049;1100`.
         candidates: All candidates in the order of the tests, from cautious to bold.
-        chosen: Index of the boldest certified candidate. None: no candidate was certified.
+        chosen: Index of the last, and so the boldest, certified candidate. None: no candidate was certified.
         provenance: How it was made.
         made: Time of the test, ISO 8601. Empty in certificates of older versions.
         earlier: All earlier tests of the same policy, the first one first.

@@ -51,7 +51,7 @@ def only_of_trees(settings: DrafterProposerSettings, *names: str) -> dict[str, s
     idle=lambda settings: only_of_trees(settings, "top_k", "nodes"),
 )
 def artifact() -> type:
-    """Import the kind of drafter `drafter`."""
+    """Import and return the class that trains and loads the artifact `drafter`, an EAGLE drafter."""
     from kerv_cli.methods.eagle.drafter import EagleDrafter
 
     return EagleDrafter

@@ -30,7 +30,7 @@ class EarlySettings:
     measured_by="early_unverified",
 )
 def artifact() -> type:
-    """Import the kind of drafter `early`."""
+    """Import and return the class that trains and loads the artifact `early`, the early drafter."""
     from kerv_cli.methods.early.drafter import EarlyDrafter
 
     return EarlyDrafter

@@ -43,7 +43,7 @@ LEAST = 3  # minimum number of positions for a curvature
 
 @registry.ArtifactPart("datastore", by_task=True, needs_task=True, described_by=MANIFEST)
 def artifact() -> type:
-    """Import the kind of artifact `datastore`."""
+    """Import and return the class that makes and loads datastores."""
     from kerv_cli.methods.heisd.datastore import DatastoreArtifact
 
     return DatastoreArtifact

@@ -77,12 +77,14 @@ class BoundaryRanges:
 
     @classmethod
     def fit(cls, paths: Iterable[np.ndarray], window: int, known: BoundaryRanges | None = None) -> BoundaryRanges:
-        """Measure the ranges over all windows that a boundary would see, including short ones when an episode begins.
+        """Measure the ranges over all windows of some episodes.
+
+        The first windows of an episode are shorter, as they are in a rollout.
 
         Args:
             paths: Measured hand positions of each episode, (T, 3) metres.
             window: Number of positions in a window.
-            known: Ranges to keep, if only `points` is to be measured.
+            known: An older calibration's ranges. They are kept, and only the attribute `points` is measured.
 
         Raises:
             CheckpointError: No path is curved, or the hand never moves.

@@ -313,7 +313,12 @@ class DatastoreArtifact(Artifact[Manifest]):
         return manifest
 
     def digest(self, path: Path, description: Manifest) -> str:
-        """Return the hash of the keys, the chunks and the target: `Manifest.content`."""
+        """Return the hash that identifies the datastore's content: its keys, its chunks and its target.
+
+        Args:
+            path: Folder of the datastore. Not used.
+            description: The datastore's manifest, which holds the hashes of all files.
+        """
         return description.content
 
     def load(self, path: Path, artifacts: Artifacts) -> Datastore:

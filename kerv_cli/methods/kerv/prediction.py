@@ -39,7 +39,8 @@ class Noise:
     Attributes:
         q: Process noise: variance of the random acceleration per control step.
         r: Measurement noise: variance of the observed actions.
-        damping: Factor of the velocity per control step. 1: constant velocity, *ours*, too; less than 1 for `damped`.
+        damping: Factor by which the velocity changes per control step. 1 (constant velocity) for the predictor
+            `kalman`, less than 1 for `damped`.
     """
 
     q: tuple[float, ...]

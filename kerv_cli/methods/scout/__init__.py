@@ -34,7 +34,7 @@ class ScoutSettings(EarlySettings):
     measured_by="scout_unverified",
 )
 def artifact() -> type:
-    """Import the kind of drafter `scout`."""
+    """Import and return the class that trains and loads the artifact `scout`."""
     from kerv_cli.methods.scout.drafter import ScoutDrafter
 
     return ScoutDrafter

@@ -203,7 +203,9 @@ class ScoutDrafter(EarlyDrafter):
     def decoded(
         self, target: Any, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace, columns: dict[str, Tensor]
     ) -> ScoutExamples:
-        """Decode observations of an episode, and keep them with the positions that the target estimates.
+        """Let the target decode observations of an episode, and return them as training examples.
+
+        An example's labels are the target's tokens, and the target's estimates of the positions of object and goal.
 
         Raises:
             CheckpointError: The target has no camera, or the images have another size than the target takes.

@@ -344,7 +344,9 @@ def choose(frame, columns, numbers):
 
 @compiled
 def elementwise(code, frame, columns, numbers, indices):
-    """Execute one operation on one frame, the memory of a row. LINEAR and ATTEND are executed elsewhere.
+    """Execute one operation on one frame (the memory of one row of the batch), in place.
+
+    `run` executes LINEAR and ATTEND itself.
 
     Args:
         code: The operation, such as ADD.

@@ -219,14 +219,22 @@ class CompactTarget(Compilable):
         return Inputs(images, proprioception, state, upload([words], self.device))
 
     def encode(self, observation: Observation) -> Tensor:
-        """Encode an observation as a prompt (1, P, E); errors as `inputs`."""
+        """Encode an observation as a prompt (1, P, E).
+
+        Raises:
+            CheckpointError: The observation does not fit the target, see `inputs`.
+        """
         inputs = self.inputs(observation)
         prompt, places = self.encode_batch(inputs)
         self.hand_and_object = inputs.proprioception[0, :3], places[0, 0]
         return prompt
 
     def encode_many(self, observations: Sequence[Observation]) -> Tensor:
-        """Encode B observations as prompts (B, P, E); errors as `inputs`."""
+        """Encode B observations as prompts (B, P, E).
+
+        Raises:
+            CheckpointError: An observation does not fit the target, see `inputs`.
+        """
         batch = [self.inputs(observation) for observation in observations]
         images = [one.images for one in batch if one.images is not None]
         rows = (torch.cat([getattr(one, name) for one in batch]) for name in ("proprioception", "states", "words"))
@@ -311,7 +319,10 @@ class CompactTarget(Compilable):
         return Program(function, *shapes, repeats=repeats) if self.compiled is not None else None
 
     def enlarge(self, drafter: Any) -> None:
-        """Enlarge a drafter as this target was enlarged, if it was; see `JoinsDrafters.enlarge`."""
+        """Enlarge a small policy's drafter in place, so that it fits this target.
+
+        Does nothing if this target was not made by enlarging a small policy (docs/methods.md §0.2).
+        """
         if self.enlarges is not None:
             self.enlarges(drafter)
 
