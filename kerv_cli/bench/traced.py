@@ -89,8 +89,8 @@ def _resampled(
 def choose_length(trace: Sequence[TracedDecode], costs: Costs) -> list[dict[str, Any]]:
     """Return how fast chains of each length would have been, for each setting of a trace that drafts chains.
 
-    A draft's i-th token is accepted with the share of recorded drafts that were at least i tokens long, accepted before
-    it, and accepted there, too. Chains inside a prefill do not count.
+    The probability that the i-th draft token is accepted is measured on the recorded drafts that had an i-th token and
+    whose earlier tokens were all accepted. Chains inside a prefill do not count.
 
     Returns:
         For each setting and chunk length: the fastest length of chains, the share of the resampled episodes in which it
