@@ -409,7 +409,7 @@ def test_a_full_disk_keeps_what_was_committed(tmp_path):
 
 
 def test_a_study_that_is_not_there_names_what_to_run(database, tmp_path):
-    with refused("no study 'threshold'", "run `kerv sweep study=threshold`", error=UsageError):
+    with refused("no study 'threshold'", "run `kerv sweep study=threshold", error=UsageError):
         StudyStore(opened(tmp_path), "threshold").load()
     for name in ("../up", "a/b", "", ".hidden"):
         with pytest.raises(UsageError, match="study name"):
