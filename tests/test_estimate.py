@@ -131,13 +131,6 @@ def measured_profile(table: str) -> Profile:
     return replace(profile, phases=phases)
 
 
-TOKEN = "a token of AR took 27 ms in the profile's decodes of 16 tokens, 22.5 in the study's of 4; why is open"
-_OFF = ("kerv", "kerv literal", "heisd", "heisd_code", "one_pass", "one_pass_streak")
-MISSES = dict.fromkeys([("papers", label) for label in _OFF], TOKEN)
-"""Setting of a table -> why its estimate is not within 15 %. `main` has no profile: those that ship are of a program
-whose tokens cost four times as much."""
-
-
 @pytest.mark.parametrize("table", ["papers", "papers_libero"])
 def test_every_method_of_a_published_table_is_estimated_within_15_per_cent(table):
     profile, settings = measured_profile(table), recorded(table)
@@ -147,8 +140,8 @@ def test_every_method_of_a_published_table_is_estimated_within_15_per_cent(table
         decodes = Decodes(profile, one.tokens, one.drafts)
         estimated = decodes.speed([decodes.acceptance_for(one.forwards)])
         if not 0.85 <= estimated / one.speed <= 1.15:
-            off[table, one.label] = f"{estimated:.2f}, measured {one.speed:.2f}"
-    assert off.keys() == {place for place in MISSES if place[0] == table}, off
+            off[one.label] = f"{estimated:.2f}, measured {one.speed:.2f}"
+    assert off == {}
 
 
 @pytest.mark.parametrize("table", TABLES)
