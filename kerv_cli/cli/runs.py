@@ -176,11 +176,8 @@ def watch(settings: CommandSettings, names: list[str]) -> None:
         runs = {run.id: run for run in find_runs(database) if chosen in ("", run.id)}
         running = [name for name, run in runs.items() if run.is_running]
         for name in dict.fromkeys([*shown, *running]):
-            line = (
-                ", ".join(filter(None, (name, runs[name].state, runs[name].left)))
-                if name in runs
-                else f"{name} is gone"
-            )
+            run = runs.get(name)
+            line = ", ".join(filter(None, (name, run.state, run.left))) if run else f"{name} is gone"
             if shown.get(name) != line:
                 typer.echo(line)
             shown[name] = line
@@ -188,9 +185,7 @@ def watch(settings: CommandSettings, names: list[str]) -> None:
             break
         time.sleep(BEAT_SECONDS)
     if not shown:
-        typer.echo(
-            f"nothing runs in {settings.results}" if not chosen else f"{chosen} does not run: {runs[chosen].state}"
-        )
+        typer.echo(f"{chosen} does not run: {runs[chosen].state}" if chosen else f"nothing runs in {settings.results}")
 
 
 @_command_on_runs("compare", "kerv runs compare main:ar main:kerv", "kerv runs compare main last")

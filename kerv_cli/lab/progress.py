@@ -102,8 +102,8 @@ class Progress:
 class TimeLeft:
     """Estimates how long the missing episodes of a plan take, and corrects that with each episode that ends.
 
-    An episode is expected to take as long as those of its setting took on average, or all others if its setting has
-    none. The workers share the total equally.
+    An episode is expected to take the mean time of its setting's episodes, or, if its setting has none, of all
+    episodes. The workers share the total equally.
 
     Args:
         plan: The plan.
@@ -118,7 +118,8 @@ class TimeLeft:
         with plan.store.database.reading() as connection:
             rows = connection.execute(query.where(EPISODES.c.work.in_(works)).group_by(EPISODES.c.work)).all()
         self._stored = {work: float(mean) for work, mean, _ in rows if mean is not None}
-        self._measured: defaultdict[str, list[float]] = defaultdict(list)
+        self._ended: Counter[str] = Counter()
+        self._measured: defaultdict[str, float] = defaultdict(float)  # seconds of those that ended, by setting
         stored = sum(number for *_, number in rows)
         self.source = f"measured on {stored} stored episodes" if stored else f"a guess of {guess:g} s per episode"
 
@@ -127,13 +128,14 @@ class TimeLeft:
         if isinstance(event, events.EpisodeEnd):
             self._waiting[event.episode.setting.work] -= 1
             if event.seconds:
-                self._measured[event.episode.setting.work].append(event.seconds)
+                self._ended[event.episode.setting.work] += 1
+                self._measured[event.episode.setting.work] += event.seconds
         elif isinstance(event, events.SettingFailed):
             self._waiting.subtract(one.setting.work for one in event.episodes)
 
     @property
     def seconds(self) -> float:
         """Seconds that the episodes still take that have neither ended nor failed."""
-        means = self._stored | {work: sum(seconds) / len(seconds) for work, seconds in self._measured.items()}
+        means = self._stored | {work: self._measured[work] / number for work, number in self._ended.items()}
         mean = sum(means.values()) / len(means) if means else self._guess
         return sum(number * means.get(work, mean) for work, number in self._waiting.items()) / self.workers

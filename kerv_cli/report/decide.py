@@ -215,10 +215,12 @@ def with_matched_speed(rows: Sequence[Result]) -> list[Result]:
     for row in rows:
         if (row.where, row.baseline) in solved and not row.is_baseline and row.measures.pairs:
             groups.setdefault((row.where, row.method, row.baseline), []).append(row)
+    fastest: dict[tuple[str, str, str], float] = {}
+    for key, group in groups.items():
+        speeds = [row.measures.episode_speedup.value for row in passing(sorted(group, key=safety), MARGIN)]
+        fastest[key] = max((speed for speed in speeds if speed > 0), default=math.nan)
     matched = []
     for row in rows:
-        group = [] if row.is_baseline else groups.get((row.where, row.method, row.baseline), [])
-        speeds = [one.measures.episode_speedup.value for one in passing(sorted(group, key=safety), MARGIN)]
-        fastest = max((speed for speed in speeds if speed > 0), default=math.nan)
-        matched.append(replace(row, matched_success_speed=fastest))
+        speed = math.nan if row.is_baseline else fastest.get((row.where, row.method, row.baseline), math.nan)
+        matched.append(replace(row, matched_success_speed=speed))
     return matched
