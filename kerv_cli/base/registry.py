@@ -32,7 +32,7 @@ MODULES: Mapping[str, Sequence[str]] = {
     "stress": ("kerv_cli.worlds.stress.kinds",),
     "target": ("kerv_cli.targets",),
 }
-"""The modules that register kerv's own parts of a kind. `kerv_cli.methods` registers those of all other kinds."""
+"""The modules that register kerv's own parts of a kind. `kerv_cli.methods` registers the parts of all other kinds."""
 
 METHOD_KINDS = ("prefill_draft", "proposer", "acceptance", "threshold", "rectifier", "boundary", "skip")
 """The parts of a method, in the order in which a decode uses them."""
@@ -201,7 +201,7 @@ class DrafterPart(ProposerPart):
     """A drafter with weights: an artifact, which `kerv train drafter drafter=NAME` trains, and a proposer.
 
     The decorated function imports and returns the subclass of `TrainableDrafter` (`kerv_cli/methods/drafters.py`).
-    `settings` are those of the proposer.
+    `settings` is the class of the proposer's settings.
 
     Args:
         trained: Dataclass of the settings of its shapes and training.

@@ -1,6 +1,6 @@
 """Compute what a decode costs on average, from a profile and from how often draft tokens are accepted.
 
-The costs are those of `engine.cost`: a decode is a prefill, then rounds of a draft and a verification. How a method
+`engine.cost` gives the costs: a decode is a prefill, then rounds of a draft and a verification. How a method
 drafts is given, or read from a published table. Nothing is run, and this module needs no torch.
 """
 

@@ -62,7 +62,7 @@ def import_databases(database: Database, files: Sequence[Path], name: str = "") 
         Names of the imported studies, and a line of text about each study that was left out.
 
     Raises:
-        UsageError: A file is that of `database`. Or `name` is given, and a file does not hold exactly one study.
+        UsageError: A file is `database` itself. Or `name` is given, and a file does not hold exactly one study.
         CheckpointError: A file is damaged, or was written by a newer version of kerv.
     """
     names: list[str] = []

@@ -157,7 +157,7 @@ class TargetSide:
         return self.prompt.shape[1]
 
     def uncached(self, tokens: Sequence[int]) -> list[int]:
-        """Return those of the committed `tokens` that the target has not read yet. Empty before the prefill.
+        """Return the committed `tokens` that the target has not read yet. Empty before the prefill.
 
         Usually this is only the newest token. After a rectifier has filled a control step, it may be several.
         """

@@ -328,7 +328,7 @@ def _reasons(
     rerun: str,
     earlier: Mapping[str, tuple[Setting, str]],
 ) -> dict[Episode, str]:
-    """Return the missing episodes, each with the reason for running it. The arguments are those of `split`."""
+    """Return the missing episodes, each with the reason for running it. `split` explains the arguments."""
     works, tasks = {key[0] for key in stored}, {key[:2] for key in stored}
     of_rows = {TIMED: "times wanted in turn", CHANGED: "other code", ALL: "rerun=all"}.get(rerun, "order of episodes")
 

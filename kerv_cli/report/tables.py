@@ -474,7 +474,7 @@ def summed_table(results: Iterable[Result]) -> pd.DataFrame:
 
     Returns:
         One row for each method and each way of pooling. `method` is the setting's label without stress. `sum` says what
-        was pooled, such as `push`, `level 2` or `all`. `label` consists of both. The further columns are those of a
+        was pooled, such as `push`, `level 2` or `all`. `label` consists of both. The other columns are the same as in a
         study's table.
     """
     rows = [row for row in averaged(results) if row.stress != NO_STRESS]

@@ -272,7 +272,7 @@ def fit_boundary(
 def completed(old: Calibration, new: Calibration) -> Calibration:
     """Return the old calibration with numbers of the new one where the old one has none.
 
-    Its boundary ranges are those of `new`, which kept the old ones where there were any.
+    It takes the boundary ranges of `new`, which kept the old ones where there were any.
     """
     noise = {}
     for kind in FILTERS:

@@ -53,7 +53,7 @@ class Index(ABC):
     """A search for stored rows with keys most similar to a given key. The rows found are then ranked exactly."""
 
     def __init__(self, store: Datastore, settings: Any) -> None:
-        """Keep the datastore; `settings` are those of the search."""
+        """Keep the datastore. `settings` configures the search."""
         self.store = store
 
     @abstractmethod

@@ -362,7 +362,7 @@ class CompactTarget(Compilable):
     ) -> tuple[Tensor, Tensor]:
         """Read T new tokens, and return the most probable token after each (T,) and their hidden states (1, T, E).
 
-        A compiled target needs one call for it. The other arguments are those of `Trunk.forward`.
+        A compiled target needs one call for it. `Trunk.forward` explains the other arguments.
         """
         if self.compiled is None or cache.fixed:
             hidden = self(self.embed(tokens[None]), positions, cache, seen)
