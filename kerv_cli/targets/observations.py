@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -26,6 +26,21 @@ from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames
 
 BATCH = 64
 """Number of observations that a target encodes and decodes at once."""
+
+
+@runtime_checkable
+class LocatesPlaces(Protocol):
+    """A target that takes observations as tensors, and estimates where object and goal are. A scout needs both."""
+
+    words: WordTokenizer
+    settings: TargetSettings
+    frame_shape: tuple[int, int, int]  # height, width and 3 colours of an image, with all views side by side
+
+    def inputs(self, observation: Observation) -> Inputs:
+        """Return an observation as tensors on the target's device, a batch of one."""
+
+    def encode_batch(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
+        """Return prompts (B, P, E), and the estimated positions (B, K, 3) of the K places, in metres."""
 
 
 @dataclass(frozen=True)

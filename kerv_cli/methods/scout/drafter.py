@@ -29,10 +29,10 @@ from kerv_cli.methods.scout import ScoutSettings
 from kerv_cli.targets.compact.compilable import FORMATS, Compilable, wants_gradient
 from kerv_cli.targets.compact.features import hand_features, mlp, scene_features, scene_width
 from kerv_cli.targets.compact.program import Program
-from kerv_cli.targets.compact.target import CompactTarget, Inputs
+from kerv_cli.targets.compact.target import Inputs
 from kerv_cli.targets.compact.vision import VisionEncoder
 from kerv_cli.targets.losses import position_loss
-from kerv_cli.targets.observations import BATCH, Observations, read_observations
+from kerv_cli.targets.observations import BATCH, LocatesPlaces, Observations, read_observations
 from kerv_cli.worlds.demos.files import DemoEpisode
 
 
@@ -142,7 +142,7 @@ class ScoutProposer(EarlyProposer):
 
     name = "scout"
 
-    def __init__(self, scout: ScoutNetwork, target: CompactTarget) -> None:
+    def __init__(self, scout: ScoutNetwork, target: Any) -> None:
         self.scout, self.inputs = scout, target.inputs
         super().__init__(scout.drafter, target)
 
@@ -177,7 +177,7 @@ class ScoutExamples(Observations, Decodes):
 
 
 class ScoutDrafter(EarlyDrafter):
-    """The kind of artifact `scout`: a drafter with its own vision encoder, for compact targets with cameras.
+    """The kind of artifact `scout`: a drafter with its own vision encoder, for targets with cameras.
 
     In the first `train.scene_steps` steps of its training it learns only to estimate positions.
     """
@@ -191,8 +191,8 @@ class ScoutDrafter(EarlyDrafter):
         Raises:
             CheckpointError: The target has no camera.
         """
-        target = check_sees(target)
-        shape = len(target.encoders), target.settings.image_size, target.words.size
+        size, width, _ = check_sees(target).frame_shape
+        shape = width // size, size, target.words.size
         return ScoutNetwork(settings, target.actions, target.observation, target.chunk, *shape)
 
     @classmethod
@@ -248,12 +248,14 @@ class ScoutDrafter(EarlyDrafter):
         return {f"{name}_error_cm": 100 * float(e) for name, e in zip(names, error, strict=True)}
 
 
-def check_sees(target: object) -> CompactTarget:
-    """Return the target, if it is a compact target with a camera.
+def check_sees(target: Any) -> LocatesPlaces:
+    """Return the target, if it has a camera and estimates positions.
 
     Raises:
-        CheckpointError: The target is of another family, or has no camera.
+        CheckpointError: The target has no camera, or estimates no positions.
     """
-    if not isinstance(target, CompactTarget) or not target.cameras:
-        raise CheckpointError("a scout needs a compact target with a camera (policy=vision); this target has none")
+    if not isinstance(target, LocatesPlaces) or not getattr(target, "cameras", ()):
+        raise CheckpointError(
+            "a scout needs a target with a camera that locates object and goal (policy=vision); this one has none"
+        )
     return target
