@@ -30,7 +30,9 @@ def serve(settings: ServeSettings, plan: ShowPlan = False) -> None:
         end_with_plan(f"{settings.policy.target} with {settings.method} on ws://{settings.host}:{settings.port}")
     with server.listening(settings.host, settings.port) as port, contextlib.suppress(KeyboardInterrupt):
         _log(f"{settings.policy.target} with {settings.method} listens on ws://{settings.host}:{port}")
-        threading.Event().wait()
+        never = threading.Event()
+        while not never.wait(0.5):  # the system may give a signal to another thread, and that does not wake this one
+            pass
     _log("stopped")
     end_at_once()
 
