@@ -83,14 +83,14 @@ def make_app(database: Database) -> Starlette:
     app = Starlette(
         routes=[*runs.ROUTES, *studies.ROUTES, *episodes.ROUTES, *training.ROUTES, *files],
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=_HOSTS), Middleware(SameOrigin)],
-        exception_handlers=dict.fromkeys((KervError, HTTPException, Exception), _failed),
+        exception_handlers=dict.fromkeys((KervError, HTTPException, Exception), failed),
     )
     app.state.database = database
     app.state.only = frozenset()  # ids of the runs to list; empty: all
     return app
 
 
-async def _failed(request: Request, error: Exception) -> Response:
+def failed(request: Request, error: Exception) -> Response:
     """Return the page for an error: 404 if something does not exist, 500 if something is damaged."""
     if isinstance(error, HTTPException):
         return render(request, "error.html", error.status_code, reason=error.detail)

@@ -119,15 +119,12 @@ def cells_of(rows: Sequence[Any], baseline: str, settings: Mapping[str, Setting]
         stress = stress_of(one.settings)
         names[label] = f"{stress['kind']} {stress['level']}" if stress["level"] else ""
     solved = {(row.label, row.task, row.seed): row.success for row in rows if row.episode is not None}
-    return [
-        Cell(
-            *(row.label, row.task, row.seed, row.episode),
-            _kind(row, solved.get((references[row.label], row.task, row.seed))),
-            phase_of(row.closest_approach, row.object_moved),
-            names[row.label],
-        )
-        for row in rows
-    ]
+    cells = []
+    for row in rows:
+        kind = _kind(row, solved.get((references[row.label], row.task, row.seed)))
+        phase = phase_of(row.closest_approach, row.object_moved)
+        cells.append(Cell(row.label, row.task, row.seed, row.episode, kind, phase, names[row.label]))
+    return cells
 
 
 def _kind(row: Any, baseline: bool | None) -> str:

@@ -1,28 +1,30 @@
 """Write the board's pages as files that a browser opens without a server, and that can be sent to a colleague.
 
-The pages come from the web app: this module requests each of them as a browser would, without a network. Links lead to
+The pages come from the web app: this module calls the function of each, without a server or a network. Links lead to
 the written files. A link to a page that is not exported becomes plain text. Elements with the attribute `data-live`,
 such as forms and buttons, are left out.
 """
 
 from __future__ import annotations
 
-import asyncio
 import html
 import os
 import re
-from collections.abc import Collection, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Collection
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote, urljoin, urlsplit
 
 from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Match
+from starlette.staticfiles import StaticFiles
 
 from kerv_cli.base.errors import KervError
-from kerv_cli.board.app import make_app
+from kerv_cli.board.app import failed, make_app
 from kerv_cli.lab.database import Database
 
 MOST_EPISODES = 400
@@ -47,15 +49,13 @@ def export_board(database: Database, names: Collection[str], folder: Path) -> li
     """
     app = make_app(database)
     app.state.only = frozenset(names)
-    with ThreadPoolExecutor(1) as own:  # a notebook's thread has an event loop already
-        pages = own.submit(asyncio.run, _collected(app)).result()
+    pages = _collected(app)
     written = []
-    for address, answer in pages.items():
+    for address, content in pages.items():
         path = folder / file_of(address)
         path.parent.mkdir(parents=True, exist_ok=True)
-        content = answer.body
-        if answer.is_page:
-            content = _Static(address, pages).rewritten(answer.text).encode()
+        if isinstance(content, str):
+            content = _Static(address, pages).rewritten(content).encode()
         path.write_bytes(content)
         written.append(path)
     return written
@@ -74,75 +74,52 @@ def file_of(address: str) -> str:
     return "" if path else "index.html"
 
 
-@dataclass
-class _Answer:
-    """An answer of the web app."""
-
-    status: int = 0
-    kind: str = ""
-    body: bytes = b""
-
-    @property
-    def is_page(self) -> bool:
-        """Whether it is HTML."""
-        return self.kind.startswith("text/html")
-
-    @property
-    def text(self) -> str:
-        """The answer as text."""
-        return self.body.decode()
-
-
-async def _asked(app: Starlette, address: str) -> _Answer:
-    """Return what the web app answers to GET, without a network."""
-    parts, answer = urlsplit(address), _Answer()
-    scope: dict[str, Any] = {
-        "type": "http", "asgi": {"version": "3.0"}, "http_version": "1.1", "method": "GET", "scheme": "http",
-        "path": unquote(parts.path), "raw_path": parts.path.encode(), "query_string": parts.query.encode(),
-        "root_path": "", "headers": [(b"host", b"localhost")], "client": None, "server": ("localhost", 80),
-    }  # fmt: skip
-
-    is_sent = False
-
-    async def receive() -> dict[str, Any]:
-        nonlocal is_sent
-        if is_sent:
-            await asyncio.Event().wait()  # a file's answer waits for the end of the connection, which never comes
-        is_sent = True
-        return {"type": "http.request", "body": b"", "more_body": False}
-
-    async def send(message: Any) -> None:
-        if message["type"] == "http.response.start":
-            answer.status = message["status"]
-            answer.kind = dict(message["headers"]).get(b"content-type", b"").decode()
-        else:
-            answer.body += message.get("body", b"")
-
-    await app(scope, receive, send)
-    return answer
+def _asked(app: Starlette, address: str) -> Response:
+    """Call the function of the page at an address, as for a GET. Return its answer."""
+    parts = urlsplit(address)
+    path, query = unquote(parts.path), parts.query.encode()
+    scope: dict[str, Any] = {"type": "http", "method": "GET", "path": path, "query_string": query, "app": app}
+    scope["headers"] = [(b"host", b"localhost")]
+    for route in app.routes:
+        match, found = route.matches(scope)
+        if match is Match.FULL:
+            scope |= found
+            break
+    request, answer = Request(scope), scope.get("endpoint")
+    try:
+        if isinstance(answer, StaticFiles):
+            file, _ = answer.lookup_path(Path(path).name)
+            return Response(Path(file).read_bytes())
+        page: Response = answer(request)
+        return page
+    except (KervError, HTTPException) as error:
+        return failed(request, error)
 
 
-async def _collected(app: Starlette) -> dict[str, _Answer]:
+def _collected(app: Starlette) -> dict[str, str | bytes]:
     """Ask for the first page and for all that it leads to. Return the answers by address, without those that fail.
 
     Parts of a page that a browser loads later (`hx-trigger="load"`) are put into it.
     """
-    waiting, pages, films, episodes = ["/"], dict[str, _Answer](), 0, 0
+    pages: dict[str, str | bytes] = {}
+    waiting, films, episodes = ["/"], 0, 0
     seen = set(waiting)
     while waiting:
         address = waiting.pop(0)
-        if not _is_film(address) or films < MOST_FILM_BYTES:
-            answer = await _asked(app, address)
-            if address == "/" and answer.status != 200:
-                raise KervError(f"the board cannot show its first page: {answer.text[:200]}")
-            if answer.status == 200:
-                pages[address] = answer
-                films += len(answer.body) if _is_film(address) else 0
-        if address not in pages or not pages[address].is_page:
+        is_film = file_of(address).endswith(".gif")
+        if is_film and films >= MOST_FILM_BYTES:
             continue
-        page = pages[address]
-        page.body = (await _filled(app, address, page.text)).encode()
-        for link in _links(address, page.text):
+        answer = _asked(app, address)
+        if answer.status_code != 200:
+            if address == "/":
+                raise KervError(f"the board cannot show its first page: {bytes(answer.body).decode()[:200]}")
+            continue
+        pages[address] = content = bytes(answer.body)
+        films += len(content) if is_film else 0
+        if answer.media_type != "text/html":
+            continue
+        pages[address] = page = _filled(app, address, content.decode())
+        for link in _links(address, page):
             if link in seen or not file_of(link):
                 continue
             if re.fullmatch(r"/episodes/\d+", link):
@@ -154,17 +131,13 @@ async def _collected(app: Starlette) -> dict[str, _Answer]:
     return pages
 
 
-def _is_film(address: str) -> bool:
-    return file_of(address).endswith(".gif")
-
-
-async def _filled(app: Starlette, address: str, text: str) -> str:
+def _filled(app: Starlette, address: str, text: str) -> str:
     """Return a page with the parts that a browser would load at once."""
     late = re.search(r'<(section) id="(\w+)"[^>]* hx-get="([^"]+)" hx-trigger="load".*?</section>', text, re.DOTALL)
     if late is None:
         return text
-    part = await _asked(app, urljoin(address, html.unescape(late[3])))
-    return text.replace(late[0], part.text)
+    part = _asked(app, urljoin(address, html.unescape(late[3])))
+    return text.replace(late[0], bytes(part.body).decode())
 
 
 def _plain(address: str, link: str) -> str:
@@ -184,10 +157,10 @@ class _Static(HTMLParser):
 
     Args:
         address: The page's address.
-        pages: All that is exported, by address.
+        pages: Addresses of all that is exported.
     """
 
-    def __init__(self, address: str, pages: Mapping[str, _Answer]) -> None:
+    def __init__(self, address: str, pages: Collection[str]) -> None:
         super().__init__(convert_charrefs=False)
         self.address, self.pages = address, pages
         self.parts: list[str] = []
