@@ -35,7 +35,8 @@ from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.methods.parallel import ParallelPass
 from kerv_cli.methods.streak import AlwaysSkip
 from kerv_cli.report.plots import study_figures
-from kerv_cli.report.reprice import NamedProfile, repriced
+from kerv_cli.report.profiles import NamedProfile
+from kerv_cli.report.reprice import repriced
 from kerv_cli.report.summary import summary_frame
 from kerv_cli.report.tables import load_study
 from kerv_cli.targets.compact.compilable import compile_parts

@@ -22,7 +22,8 @@ from kerv_cli.engine.cost import Profile, prices, read_profile, work_of_record
 from kerv_cli.engine.record import DecodeRecord, Round
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.reprice import open_profiles, prices_table, repriced
+from kerv_cli.report.profiles import open_profiles
+from kerv_cli.report.reprice import prices_table, repriced
 from kerv_cli.report.tables import load_study
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -17,7 +17,8 @@ from kerv_cli.engine.cost import Profile, prices, work_of_record
 from kerv_cli.episodes.rows import decode_records
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import StudyStore
-from kerv_cli.report.reprice import NamedProfile, open_profiles, own_prices, prices_table, repriced, repriced_summary
+from kerv_cli.report.profiles import NamedProfile, open_profiles
+from kerv_cli.report.reprice import own_prices, prices_table, repriced, repriced_summary
 from kerv_cli.report.tables import load_study
 
 PROFILE = Profile(

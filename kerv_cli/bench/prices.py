@@ -5,17 +5,17 @@ Nothing is run and nothing is measured. This module needs no torch. `tables.py` 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-from kerv_cli.base.errors import UsageError
 from kerv_cli.bench.described import Described
 from kerv_cli.bench.expected import Decodes, Drafts, Recorded, nearest_table, recorded
 from kerv_cli.bench.physics import DEVICES, ENGINES, ROOFLINE, SHAPES, Device, Engine, Shape, priced
 from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.cost import Profile
+from kerv_cli.report.profiles import NamedProfile
 
 NO_TOKENS = (
     "speculation does not apply: the policy emits no action tokens, so there is nothing to draft. What applies: longer "
@@ -57,28 +57,13 @@ FAMILIES = (
 _PUBLISHED_TOKENS = 7
 
 
-@dataclass(frozen=True)
-class Costs:
-    """The costs of a policy's decodes with an engine.
-
-    Attributes:
-        engine: Name of the engine, or of a measured profile.
-        profile: Seconds of each phase.
-        bounds: What bounds the encoder, the prefill and one further token. Empty if the profile was measured.
-    """
-
-    engine: str
-    profile: Profile
-    bounds: Mapping[str, str]
-
-
-def computed(policy: Described, device: Device) -> list[Costs]:
-    """Return the costs of a policy on a device, with each engine."""
+def computed(policy: Described, device: Device) -> list[NamedProfile]:
+    """Return the costs of a policy on a device with each engine, named after the engine."""
     assert policy.shape is not None
     return [_computed(policy.shape, policy.encoder, device, engine) for engine in ENGINES.values()]
 
 
-def _computed(shape: Shape, encoder: float | None, device: Device, engine: Engine) -> Costs:
+def _computed(shape: Shape, encoder: float | None, device: Device, engine: Engine) -> NamedProfile:
     profile = priced(shape, device, engine)
     needs = {"encode": shape.needs("encode", 1), "prefill": shape.needs("prefill", shape.prompt)}
     needs["verify"] = shape.needs("verify", 1)
@@ -88,18 +73,7 @@ def _computed(shape: Shape, encoder: float | None, device: Device, engine: Engin
         bounds["encode"] = "given"
     elif not profile.seconds("encode", 1):
         bounds["encode"] = "none"
-    return Costs(engine.name, profile, bounds)
-
-
-def check_tokens(name: str, profile: Profile, tokens: int) -> None:
-    """Check that a profile has costs of chunks of so many tokens.
-
-    Raises:
-        UsageError: Its costs are for shorter chunks.
-    """
-    if profile.tokens < tokens:
-        command = f"kerv bench target={profile.about.get('target', 'TARGET')} tokens={tokens}"
-        raise UsageError(f"on={name}: its costs are for chunks of {profile.tokens} tokens. Measure it with '{command}'")
+    return NamedProfile(engine.name, profile, bounds)
 
 
 @dataclass(frozen=True)
@@ -133,7 +107,7 @@ class Estimate:
         tokens: N, tokens of a chunk.
     """
 
-    costs: Costs
+    costs: NamedProfile
     tokens: int
 
     @property

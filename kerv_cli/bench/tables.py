@@ -171,12 +171,12 @@ def sentence(estimates: Sequence[Estimate]) -> str:
     gains = {f"{one.family.method} ({one.own:.2f} at kerv's acceptance)": one.own for one in verified if one.own}
     if worst is not best and worst.seconds > best.seconds:
         gain = worst.seconds / best.seconds
-        gains[f"a {best.costs.engine} engine ({gain:.2f} over {worst.costs.engine} code)"] = gain
+        gains[f"a {best.costs.name} engine ({gain:.2f} over {worst.costs.name} code)"] = gain
     without = 1 / (1 - best.encoder)
     gains[f"a faster vision encoder (at most {without:.2f})"] = without
     first = sorted(gains, key=lambda name: -gains[name])
     names = [name for name in first if gains[name] > 1.05] or ["a smaller or faster target"]
-    engine = f" with a {best.costs.engine} engine" if best.costs.bounds else ""
+    engine = f" with a {best.costs.name} engine" if best.costs.bounds else ""
     return (
         f"{tokens}{engine} speculation can give at most {top.ceiling:.2f}{unverified}; the encoder takes "
         f"{100 * best.encoder:.0f} %; what pays first is {', then '.join(names[:2])}."
@@ -206,7 +206,7 @@ def rate(estimates: Sequence[Estimate], hz: float, actions: int) -> str:
             who = f"at kerv's acceptance {', '.join(enough)} would be"
         elif best:
             who = f"only with all drafts accepted {', '.join(best)} would be"
-        words.append(f"{one.costs.engine}: AR takes {1e3 * one.seconds:.3g} ms, {who}")
+        words.append(f"{one.costs.name}: AR takes {1e3 * one.seconds:.3g} ms, {who}")
     return f"{hz:g} Hz leave {1e3 * limit:.3g} ms per decode. {'; '.join(words)}."
 
 
@@ -227,7 +227,7 @@ def document(one: Estimate) -> dict[str, Any]:
             "break_even_tokens": answer.break_even,
         }
         families.append(row)
-    about = {"engine": one.costs.engine, "ms": 1e3 * one.seconds, "encoder_share": one.encoder}
+    about = {"engine": one.costs.name, "ms": 1e3 * one.seconds, "encoder_share": one.encoder}
     return {**about, "parts": parts, "families": families}
 
 

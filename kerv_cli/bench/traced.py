@@ -11,9 +11,9 @@ import numpy as np
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.bench.expected import Decodes, Drafts
-from kerv_cli.bench.prices import Costs, check_tokens
 from kerv_cli.bench.trace import TracedDecode, grouped, work_of_trace
 from kerv_cli.engine.cost import prices
+from kerv_cli.report.profiles import NamedProfile
 
 _RESAMPLES = 200
 _SEED = 0
@@ -24,7 +24,7 @@ CANNOT = (
 )
 
 
-def price(trace: Sequence[TracedDecode], costs: Costs) -> list[dict[str, Any]]:
+def price(trace: Sequence[TracedDecode], costs: NamedProfile) -> list[dict[str, Any]]:
     """Return what the decodes of each setting of a trace cost.
 
     Returns:
@@ -37,10 +37,8 @@ def price(trace: Sequence[TracedDecode], costs: Costs) -> list[dict[str, Any]]:
     """
     found = []
     for name, tokens, decodes in grouped(trace):
-        check_tokens(costs.engine, costs.profile, tokens)
         work = work_of_trace(decodes, tokens)
-        if lacks := costs.profile.lacks(work.needs):
-            raise UsageError(f"on={costs.engine}: no cost of '{lacks[0]}', which setting '{name}' needs")
+        costs.check(tokens, work.needs, name)
         of_decode, episode = prices(work, costs.profile), _numbers(decodes)
         seconds, counts = np.bincount(episode, of_decode), np.bincount(episode)
         alone = counts * costs.profile.decode(tokens)
@@ -86,7 +84,7 @@ def _resampled(
     return [dict(zip(names, one, strict=True)) for one in zip(speeds, low, high, strict=True)], same
 
 
-def choose_length(trace: Sequence[TracedDecode], costs: Costs) -> list[dict[str, Any]]:
+def choose_length(trace: Sequence[TracedDecode], costs: NamedProfile) -> list[dict[str, Any]]:
     """Return how fast chains of each length would have been, for each setting of a trace that drafts chains.
 
     The probability that the i-th draft token is accepted is measured on the recorded drafts that had an i-th token and
@@ -104,9 +102,7 @@ def choose_length(trace: Sequence[TracedDecode], costs: Costs) -> list[dict[str,
         tried, accepted = _counts(decodes)
         if not len(tried):
             continue
-        check_tokens(costs.engine, costs.profile, tokens)
-        if lacks := costs.profile.lacks(["draft", "feed", "verify"]):
-            raise UsageError(f"on={costs.engine}: no cost of '{lacks[0]}'")
+        costs.check(tokens, ["draft", "feed", "verify"], name)
         plans = [Decodes(costs.profile, tokens, Drafts(length)) for length in range(tried.shape[1] + 1)]
         speeds, sure = _resampled(len(tried), partial(_speeds, plans, tried, accepted))
         lengths = [{"length": length, **one} for length, one in enumerate(speeds)]

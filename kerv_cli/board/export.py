@@ -85,7 +85,7 @@ def _asked(app: Starlette, address: str) -> Response:
         if match is Match.FULL:
             scope |= found
             break
-    request, answer = Request(scope), scope.get("endpoint")
+    request, answer = Request(scope), scope["endpoint"]
     try:
         if isinstance(answer, StaticFiles):
             file, _ = answer.lookup_path(Path(path).name)

@@ -13,7 +13,8 @@ from kerv_cli.cli.common import AsJson, end_with_json, print_rows
 
 if TYPE_CHECKING:
     from kerv_cli.bench.described import Described
-    from kerv_cli.bench.prices import Costs, Estimate
+    from kerv_cli.bench.prices import Estimate
+    from kerv_cli.report.profiles import NamedProfile
 
 
 @command(
@@ -31,7 +32,7 @@ def estimate(settings: EstimateSettings, as_json: AsJson = False) -> None:
     chains is the fastest for them.
     """
     from kerv_cli.bench.described import described
-    from kerv_cli.bench.prices import NO_TOKENS, Estimate, check_tokens
+    from kerv_cli.bench.prices import NO_TOKENS, Estimate
     from kerv_cli.bench.tables import document, notes, rate, sentence
 
     if settings.trace:
@@ -46,7 +47,7 @@ def estimate(settings: EstimateSettings, as_json: AsJson = False) -> None:
     tokens = policy.tokens if policy else 7 if settings.tokens is None else settings.tokens
     found: dict[str, list[Estimate]] = {}
     for title, costs in _costs(settings, policy):
-        check_tokens(costs.engine, costs.profile, tokens)
+        costs.check(tokens)
         found.setdefault(title, []).append(Estimate(costs, tokens))
     rows = []
     for title, estimates in found.items():
@@ -64,16 +65,14 @@ def estimate(settings: EstimateSettings, as_json: AsJson = False) -> None:
                 typer.echo(line)
 
 
-def _costs(settings: EstimateSettings, policy: Described | None) -> list[tuple[str, Costs]]:
+def _costs(settings: EstimateSettings, policy: Described | None) -> list[tuple[str, NamedProfile]]:
     """Return the costs on each machine with each engine, or of each profile, beside the machine's title."""
     from kerv_cli.bench.physics import DEVICES
-    from kerv_cli.bench.prices import Costs, computed
+    from kerv_cli.bench.prices import computed
+    from kerv_cli.report.profiles import open_profiles
 
     if policy is None:
-        from kerv_cli.report.reprice import open_profiles
-
-        profiles = open_profiles(settings.results, settings.on)
-        return [(one.title, Costs(one.name, one.profile, {})) for one in profiles]
+        return [(one.title, one) for one in open_profiles(settings.results, settings.on)]
     found = []
     for name in dict.fromkeys(settings.device):
         device = DEVICES[name]
@@ -86,7 +85,7 @@ def _print_tables(policy: Described | None, title: str, estimates: Sequence[Esti
     from kerv_cli.bench.tables import family_rows, part_rows
 
     if policy and policy.shape:
-        engines = " / ".join(one.costs.engine for one in estimates)
+        engines = " / ".join(one.costs.name for one in estimates)
         title = f"{policy.shape.name} on {title}, computed, not measured: {engines}"
     print_rows(part_rows(estimates), title)
     print_rows(family_rows(estimates), "speed against AR; break-even: accepted tokens per verification")
@@ -105,7 +104,7 @@ def _trace(settings: EstimateSettings, as_json: bool) -> None:
     answer = choose_length if settings.choose == "draft" else price
     documents, rows = [], []
     for title, costs in _costs(settings, None if settings.on else described(settings)):
-        machine = {"machine": title, "engine": costs.engine}
+        machine = {"machine": title, "engine": costs.name}
         for one in answer(trace, costs):
             documents.append(machine | one)
             rows.append(machine | trace_row(one))

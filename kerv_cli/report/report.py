@@ -14,7 +14,8 @@ from kerv_cli.lab.database import Database
 from kerv_cli.lab.store import ROLLOUT, StudyStore, studies
 from kerv_cli.report.page import LOSS, figures_of, render
 from kerv_cli.report.plots import about, png
-from kerv_cli.report.reprice import Priced, open_profiles, own_prices, prices_table, repriced
+from kerv_cli.report.profiles import open_profiles
+from kerv_cli.report.reprice import Priced, own_prices, prices_table, repriced
 from kerv_cli.report.results import Result, csv_text
 from kerv_cli.report.tables import (
     CSV_COLUMNS,

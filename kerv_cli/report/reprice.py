@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,90 +16,19 @@ import pandas as pd
 import pyarrow.compute as pc
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.paths import as_path
 from kerv_cli.engine.cost import COUNTED, READ_PHASES, Profile, Work, prices, read_profile, work_of
 from kerv_cli.episodes.identity import batch_of
 from kerv_cli.report.measures import measure, paired
-from kerv_cli.report.results import Measures, Result, Row, averaged, columns_of, is_number
+from kerv_cli.report.profiles import ENCODERS, NamedProfile, open_profiles
+from kerv_cli.report.results import Measures, Result, Row, averaged, columns_of
 from kerv_cli.report.summary import interval
 from kerv_cli.report.tables import StudyData
-from kerv_cli.targets.folders import shipped_dir
 
 ASSUMES = (
     "Speed against the baseline by the cost model: the recorded decodes at a profile's costs, as if the other machine "
     "and target decoded the same tokens in the same control steps; success is the recorded policy's"
 )
 _COLUMNS = ("index", "rounds", "similarity", *(f"seconds.{phase}" for phase in READ_PHASES))
-_SHIPPED = "-profile.json"
-_EIGHT_MS = 0.008  # what HeiSD's encoder takes on an A100 (arXiv 2603.17573)
-ENCODERS = {"encoder_floor": "its floor", "encoder_twice": "twice its floor", "encoder_8ms": "8 ms"}
-"""Column with the speed per episode at another cost of the target's encoder -> that cost, in words."""
-
-
-@dataclass(frozen=True)
-class NamedProfile:
-    """The costs of one target on one machine, from `kerv bench`, and the name that the user gave.
-
-    Attributes:
-        name: The name by which the user chose it (`on=NAME`).
-        profile: Seconds of each operation of a decode.
-    """
-
-    name: str
-    profile: Profile
-
-    @property
-    def is_projected(self) -> bool:
-        """Whether the costs were computed, not measured."""
-        return bool(self.profile.about.get("projected"))
-
-    @property
-    def title(self) -> str:
-        """Target, device and, of computed costs, the engine. Ends in "projected" if the costs were not measured."""
-        about = self.profile.about
-        names = [str(about[key]) for key in ("target", "device_name", "engine") if about.get(key)]
-        return ", ".join(names or [self.name]) + (", projected" if self.is_projected else "")
-
-    @property
-    def encoders(self) -> dict[str, Profile]:
-        """The same costs with a faster or slower encoder, by `ENCODERS`. Empty if the encoder's floor is unknown.
-
-        An engine's system time comes on top.
-        """
-        about, phases = self.profile.about, self.profile.phases
-        if not is_number(about.get("encoder_floor")):
-            return {}
-        floor, system = float(about["encoder_floor"]), float(about.get("encoder_system", 0.0))
-        costs = zip(ENCODERS, (floor + system, 2 * floor + system, _EIGHT_MS + system), strict=True)
-        return {name: replace(self.profile, phases={**phases, "encode": ((1,), (cost,))}) for name, cost in costs}
-
-
-def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfile]:
-    """Read cost profiles.
-
-    Args:
-        results: Results folder.
-        names: Each is a path, the name of a document in <results>/bench, or the name of a profile that kerv ships.
-
-    Raises:
-        UsageError: There is no such document, it has no profile, or another version of kerv wrote it.
-    """
-    folders = (Path(results) / "bench", shipped_dir().parent / "bench")
-    profiles = []
-    for name in names:
-        paths = (as_path(name), *(folder / f"{name}{end}" for folder in folders for end in (".json", _SHIPPED)))
-        path = next((path for path in paths if path.is_file()), None)
-        if path is None:
-            shipped = sorted({p.name.removesuffix(_SHIPPED) for folder in folders for p in folder.glob(f"*{_SHIPPED}")})
-            raise UsageError(
-                f"on={name}: no such profile. Make one with 'kerv bench target=TARGET'"
-                + (f", or take one of {', '.join(shipped)}" if shipped else "")
-            )
-        try:
-            profiles.append(NamedProfile(name, read_profile(path)))
-        except CheckpointError as error:
-            raise UsageError(f"on={name}: {error}") from error
-    return profiles
 
 
 @dataclass(frozen=True)
@@ -159,7 +87,7 @@ def repriced(data: StudyData, profiles: Sequence[NamedProfile]) -> list[Priced]:
     rows = []
     for named in profiles:
         for label, work in works.items():
-            _check(named, label, work)
+            named.check(work.size, work.work.needs, label)
         estimated = _estimated(data, works, named.profile)
         encoders = {name: _estimated(data, works, profile) for name, profile in named.encoders.items()}
         for result in averaged(data.results):
@@ -256,21 +184,6 @@ def levels_of(settings: Mapping[str, Any]) -> int:
     """Return the levels of the trees that a setting drafts, for episodes from before rounds had levels. 0: chains."""
     proposer = settings.get("proposer", {})
     return int(proposer["depth"]) if proposer.get("shape") == "tree" else 0
-
-
-def _check(named: NamedProfile, label: str, work: _LabelWork) -> None:
-    """Refuse a profile that lacks the costs to price a setting.
-
-    Raises:
-        UsageError: The message names the missing cost and the command that measures it.
-    """
-    command, reason = f"kerv bench target={named.profile.about.get('target', 'TARGET')} tokens={work.size}", ""
-    if lacks := named.profile.lacks(work.work.needs):
-        reason = f"no cost of '{lacks[0]}', which setting '{label}' needs"
-    elif named.profile.tokens < work.size:
-        reason = f"its costs are for chunks of {named.profile.tokens} tokens, setting '{label}' decodes {work.size}"
-    if reason:
-        raise UsageError(f"on={named.name}: {reason}. Measure it with '{command}'")
 
 
 def _priced(episodes: pd.DataFrame, work: _LabelWork, profile: Profile) -> pd.DataFrame:

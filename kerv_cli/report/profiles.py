@@ -1,0 +1,115 @@
+"""Cost profiles: the seconds of each operation of a decode, with the name that the user gave (docs/measuring.md).
+
+This module needs neither torch nor pandas.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.paths import as_path
+from kerv_cli.engine.cost import Profile, read_profile
+from kerv_cli.targets.folders import shipped_dir
+
+_SHIPPED = "-profile.json"
+_EIGHT_MS = 0.008  # what HeiSD's encoder takes on an A100 (arXiv 2603.17573)
+ENCODERS = {"encoder_floor": "its floor", "encoder_twice": "twice its floor", "encoder_8ms": "8 ms"}
+"""Column with the speed per episode at another cost of the target's encoder -> that cost, in words."""
+
+
+@dataclass(frozen=True)
+class NamedProfile:
+    """The costs of one target on one machine, from `kerv bench`, and the name that the user gave.
+
+    Attributes:
+        name: The name by which the user chose it (`on=NAME`).
+        profile: Seconds of each operation of a decode.
+        bounds: What bounds the encoder, the prefill and one further token. Empty if the costs were measured.
+    """
+
+    name: str
+    profile: Profile
+    bounds: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def is_projected(self) -> bool:
+        """Whether the costs were computed, not measured."""
+        return bool(self.profile.about.get("projected"))
+
+    @property
+    def title(self) -> str:
+        """Target, device and, of computed costs, the engine. Ends in "projected" if the costs were not measured."""
+        about = self.profile.about
+        names = [str(about[key]) for key in ("target", "device_name", "engine") if about.get(key)]
+        return ", ".join(names or [self.name]) + (", projected" if self.is_projected else "")
+
+    @property
+    def encoders(self) -> dict[str, Profile]:
+        """The same costs with a faster or slower encoder, by `ENCODERS`. Empty if the encoder's floor is unknown.
+
+        An engine's system time comes on top.
+        """
+        about, phases = self.profile.about, self.profile.phases
+        floor, system = about.get("encoder_floor"), float(about.get("encoder_system", 0.0))
+        if not isinstance(floor, int | float):
+            return {}
+        costs = zip(ENCODERS, (floor + system, 2 * floor + system, _EIGHT_MS + system), strict=True)
+        return {name: replace(self.profile, phases={**phases, "encode": ((1,), (cost,))}) for name, cost in costs}
+
+    def check(self, tokens: int, kinds: Iterable[str] = (), setting: str = "") -> None:
+        """Refuse a profile that lacks costs.
+
+        Args:
+            tokens: N, number of tokens of the chunks to price.
+            kinds: Kinds of costs that are needed.
+            setting: Label of the setting that needs them. Empty: do not name it.
+
+        Raises:
+            UsageError: The message names the missing cost and the command that measures it.
+        """
+        command = f"kerv bench target={self.profile.about.get('target', 'TARGET')} tokens={tokens}"
+        if lacks := self.profile.lacks(kinds):
+            reason = f"no cost of '{lacks[0]}'" + (f", which setting '{setting}' needs" if setting else "")
+        elif self.profile.tokens < tokens:
+            reason = f"its costs are for chunks of {self.profile.tokens} tokens"
+            reason += f", setting '{setting}' decodes {tokens}" if setting else ""
+        else:
+            return
+        raise UsageError(f"on={self.name}: {reason}. Measure it with '{command}'")
+
+
+def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfile]:
+    """Read cost profiles.
+
+    Args:
+        results: Results folder.
+        names: Each is a path, the name of a document in <results>/bench, or the name of a profile that kerv ships.
+
+    Raises:
+        UsageError: There is no such document, it has no profile, or another version of kerv wrote it.
+    """
+    folders = (Path(results) / "bench", shipped_dir().parent / "bench")
+    profiles = []
+    for name in names:
+        paths = [as_path(name)]
+        for folder in folders:
+            paths += (folder / f"{name}.json", folder / f"{name}{_SHIPPED}")
+        path = next(filter(Path.is_file, paths), None)
+        if path is None:
+            raise UsageError(f"on={name}: no such profile. Make one with 'kerv bench target=TARGET'{_known(folders)}")
+        try:
+            profiles.append(NamedProfile(name, read_profile(path)))
+        except CheckpointError as error:
+            raise UsageError(f"on={name}: {error}") from error
+    return profiles
+
+
+def _known(folders: Iterable[Path]) -> str:
+    """Return the clause of a message that names the profiles in some folders. Empty if they have none."""
+    names: set[str] = set()
+    for folder in folders:
+        names.update(path.name.removesuffix(_SHIPPED) for path in folder.glob(f"*{_SHIPPED}"))
+    return f", or take one of {', '.join(sorted(names))}" if names else ""
