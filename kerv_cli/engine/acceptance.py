@@ -27,8 +27,8 @@ class Accepted(NamedTuple):
 
     Attributes:
         path: Indices of the accepted nodes, from depth 0 down. Empty if none was accepted.
-        rejected: Index of the rejected node after the path. If several children were rejected, the one nearest to the
-            target token. None if the path ends at a leaf.
+        rejected: Index of the rejected node after the path. If several nodes follow the path, the one whose token is
+            nearest to the target's. None if the path ends at a leaf.
     """
 
     path: tuple[int, ...]
@@ -59,10 +59,10 @@ def accept_by_group(
 ) -> Accepted:
     """Return the longest path of whole kinematic groups, such as position or rotation (HeiSD's `sequence` rule).
 
-    The tokens of one group in one control step are accepted together or not at all. The distance of a token is that to
-    the target's prediction after its parent. A group is accepted if each distance is within its DoF's limit, and if the
-    distances sum to at most `group_limit`. A path ends before a group that is rejected or that is only partly in the
-    tree.
+    The tokens of one group in one control step are accepted together or not at all. A group is accepted if each token's
+    distance is within the limit of the token's DoF, and if the distances sum to at most `group_limit`. The distance of
+    a token is the absolute difference, in bins, from the target's prediction at this position. A path ends before a
+    group that is rejected or that is only partly in the tree.
 
     If `start` is inside a group, the group's first tokens are committed already. Their distance counts as 0. Only the
     group's other tokens are judged.
@@ -95,7 +95,9 @@ def accept_by_group(
 
 
 def nearest_child(tree: TokenTree, node: int, target_tokens: Sequence[int]) -> int | None:
-    """Return the child of `node` whose token is nearest to the target's prediction after `node`; None without children.
+    """Return the child of `node` whose token is nearest to the target's prediction after `node`.
+
+    Returns None if `node` has no children.
 
     Args:
         tree: The draft, n nodes.
@@ -121,16 +123,16 @@ class DistanceRule(Buildable):
         return cls(context.target.actions)
 
     def of_drafts_from(self, proposer: str) -> DistanceRule:
-        """Return the rule that judges the drafts of the proposer with this name. This base class returns itself."""
+        """Return the rule for drafts of the proposer with this name. The base class uses one rule for all proposers."""
         return self
 
     def same_limits(self, r: int, strict: bool = True) -> tuple[int, ...]:
-        """Return r for every DoF (D,). With `strict`, 0 for strict DoFs, such as the gripper."""
+        """Return the limit r for each of the D DoFs, in bins. With `strict`, strict DoFs (such as a gripper) get 0."""
         return tuple(r * (not (strict and one)) for one in self.space.is_strict)
 
     @abstractmethod
     def limits(self, r: int) -> tuple[int, ...]:
-        """Return the largest accepted distance per DoF (D,) at acceptance radius `r`, both in bins."""
+        """Return the largest accepted distance of each DoF, (D,) in bins, for the acceptance radius `r` in bins."""
 
     def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
         """Return the longest accepted path, and the node that was rejected after it.

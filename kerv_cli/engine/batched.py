@@ -36,7 +36,7 @@ class BatchDecoder:
         self._caches: dict[int, Cache] = {}
 
     def new_episode(self) -> Follower:
-        """Return what follows one more episode of the batch. It holds no actions or positions yet."""
+        """Return a `Follower` for one more episode of the batch. It holds no actions or positions yet."""
         return Follower(self.target.actions, self.target.cameras)
 
     @torch.inference_mode()
@@ -112,7 +112,8 @@ def greedy(target: Target, prompt: Tensor, cache: Cache | None = None, size: int
         size: Number of tokens N; 0 for as many as the target's chunk has.
 
     Returns:
-        Greedy tokens (B, N), and the hidden states (B, P + N − 1, E) that predict them.
+        The N most probable tokens of each prompt, (B, N). And the hidden states (B, P + N − 1, E) of the prompt and of
+        all tokens but the last.
     """
     length, size = prompt.shape[1], size or target.chunk * target.actions.dofs
     cache = cache or target.new_cache(len(prompt), length + size)

@@ -30,7 +30,7 @@ def chunk_steps(chunk: int, trained: int) -> int:
     """Return the number of control steps to decode at once.
 
     Args:
-        chunk: Control steps that the user chose. 0: as many as `trained`.
+        chunk: Number of control steps that the user chose; 0 for as many as `trained`.
         trained: Number of control steps that the target was trained for.
 
     Raises:
@@ -65,7 +65,7 @@ class ActionHistory:
 
 @dataclass(frozen=True)
 class Situation:
-    """The running episode as a method's parts see it.
+    """What the parts of a method know about the running episode.
 
     Attributes:
         task: Name of the task.
@@ -79,7 +79,7 @@ class Situation:
 
 
 class Follower:
-    """Is told about an episode: its start, every executed action and its end.
+    """Follows one episode at a time. The caller reports the start, every executed action and the end.
 
     Attributes:
         situation: The running episode so far.
@@ -100,7 +100,7 @@ class Follower:
         self.situation = Situation(task, ActionHistory(self.space.dofs), [np.asarray(end_effector)])
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
-        """Note an action that was executed.
+        """Store an action that was executed.
 
         Args:
             action: (D,), environment units.
@@ -118,9 +118,9 @@ class Rejection:
     """What follows a rejected draft token.
 
     Attributes:
-        draft: The draft tokens after the rejected one.
-        target: What the target predicts after the rejected token, then after each token of `draft`, as if those tokens
-            had been committed. So there is one more than in `draft`.
+        draft: The n draft tokens after the rejected one.
+        target: n + 1 tokens: the target's prediction after the rejected token, then after each token of `draft`. The
+            target predicts as if these tokens had been committed.
     """
 
     draft: tuple[int, ...] = ()
@@ -136,7 +136,8 @@ class TargetSide:
     Attributes:
         encode: Function that encodes the observation.
         cache: Keys and values of the prompt and of committed tokens.
-        hidden: Hidden states after the prefill, (1, P + c − 1, E) if it committed c tokens. None before the prefill.
+        hidden: Hidden states after the prefill, (1, P + c − 1, E). c is the number of tokens that the prefill
+            committed. None before the prefill.
     """
 
     encode: Callable[[], Tensor]
@@ -166,9 +167,9 @@ class TargetSide:
 
 @dataclass(eq=False)
 class Chunk:
-    """The ledger of one decode: N tokens, and the rounds that committed them.
+    """State of one decode: the tokens committed so far, and the rounds that committed them.
 
-    Parts of a method read this object. They return what they found, and the decoder writes it down here.
+    The parts of a method read it and return their results. The decoder stores these results in it.
     """
 
     steps: int  # H, control steps
@@ -198,7 +199,7 @@ class Chunk:
 
     @property
     def remaining(self) -> int:
-        """Number of tokens still to be decoded. 0 if a prediction (a rectifier) ended the chunk early."""
+        """Number of tokens still to be decoded. 0 if a rectifier's prediction ended the chunk early."""
         return 0 if self.closed is not None else self.size - len(self.tokens)
 
     @property
@@ -226,15 +227,16 @@ class Chunk:
         return float(np.abs(self.space.values_of(first) - self.space.values_of(second)).mean())
 
     def targets_along(self, chain: Sequence[int]) -> list[int] | None:
-        """Return the target's tokens for a drafted chain that the chunk's first round verified.
+        """Return the target's predictions along a chain that the first round verified.
 
         Call this before the second round, which discards the predictions after a rejected token.
 
         Args:
-            chain: A draft of the whole chunk.
+            chain: Draft of the whole chunk, N tokens.
 
         Returns:
-            At least N − 1 tokens. None if the first round verified nothing, another draft or fewer tokens.
+            The target's token at each of the first N − 1 positions or more. None if the first round did not verify
+            this chain, or verified fewer than N − 1 tokens of it.
         """
         if not self.rounds:
             return None
@@ -250,8 +252,7 @@ class Chunk:
         Args:
             record: The record of this round.
             tokens: The tokens to commit.
-            rejection: What the draft and the target have after the rejected token, see `Rejection`. None if no token
-                was rejected.
+            rejection: The tokens of draft and target after the rejected token. None if no token was rejected.
         """
         self.forwards += 1
         self.tokens += tokens
@@ -264,10 +265,10 @@ class Chunk:
         self.commit(Round(mode, start=start, target_tokens=(token,), committed=1), [token])
 
     def take(self, decision: SkipDecision) -> None:
-        """Note the decision of a skip rule, and commit the tokens that it took.
+        """Store the decision of a skip rule. If it chose tokens, commit them.
 
         Raises:
-            KervError: There are fewer than N tokens, or a drafted token is out of range.
+            KervError: The rule chose fewer than N tokens, or a drafted token is out of range.
         """
         self.reason, tokens, proposer = decision.reason, decision.tokens, decision.proposer
         if tokens is None:
@@ -283,10 +284,9 @@ class Chunk:
         self.rounds.append(Round("skip", proposer, drafted=drafted, accepted=self.size, committed=self.size))
 
     def rectify(self, found: Rectified, with_target_token: bool) -> None:
-        """Commit predicted values.
+        """Commit the values that a rectifier predicted.
 
-        The robot executes them as they are. If decoding continues, the target reads the tokens that are nearest to
-        them.
+        The robot executes these values without rounding. If decoding continues, the target reads the nearest tokens.
 
         Args:
             found: What the rectifier predicted.
@@ -314,7 +314,7 @@ class Chunk:
     def record(
         self, actions: np.ndarray, seconds: float, phases: dict[str, float], similarity: float | None = None
     ) -> DecodeRecord:
-        """Return the record of the complete chunk. The arguments are attributes of `DecodeRecord`."""
+        """Return the record of the complete chunk. Each argument becomes the record's attribute of the same name."""
         return DecodeRecord(
             tokens=tuple(self.tokens),
             actions=actions,
@@ -348,7 +348,7 @@ def deviation(space: ActionSpace, actions: np.ndarray, autoregressive: np.ndarra
 
 
 def check_tokens(tokens: np.ndarray, vocabulary: int, proposer: str) -> None:
-    """Refuse drafted tokens that are out of range.
+    """Raise an error if a drafted token is out of range.
 
     Args:
         tokens: (n,) integers.

@@ -21,13 +21,13 @@ from kerv_cli.base.registry import DRAFTING, ProposerPart
 from kerv_cli.engine.record import PARALLEL, DecodeRecord
 
 FORWARDS = ("encode", "prefill", "verify", "feed", DRAFTING, "tree")
-"""Kinds of costs that depend on the target's size (docs/measuring.md). All other kinds are drafts of proposers."""
+"""Kinds of cost that depend on the target's size (docs/measuring.md). Each other kind is a proposer's draft."""
 
 FORMAT = 2
 """Version of the profile's file format."""
 
 READ_PHASES = ("vision", "propose", "accept", "rectify", "other")
-"""Phases whose recorded seconds the cost model reads. For `vision` it only matters whether they are zero."""
+"""Phases whose recorded seconds the cost model reads. For `vision` it only reads whether they are zero."""
 
 
 COUNTED = ("mode", "proposer", "start", "tree_size", "accepted", "levels")
@@ -35,9 +35,9 @@ COUNTED = ("mode", "proposer", "start", "tree_size", "accepted", "levels")
 
 
 def source_costs() -> dict[str, list[str]]:
-    """Return, for each kind of cost, the names of the proposers whose drafts get their time from a profile.
+    """Return the names of the proposers whose drafts take their seconds from a profile, by kind of cost.
 
-    The drafts of all other proposers keep the time that was recorded for them.
+    The drafts of all other proposers keep their recorded seconds.
     """
     costs: dict[str, list[str]] = {}
     for name, part in ProposerPart.every().items():
@@ -48,12 +48,12 @@ def source_costs() -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class Profile:
-    """Seconds of every kind of forward and draft. They depend on how many rows (tokens) it processes.
+    """Measured seconds of each kind of forward and draft, for several numbers of tokens.
 
     Attributes:
         prompt: Number of prompt tokens P.
-        phases: Points of each kind of cost, as (rows, seconds). `rows` increases. `seconds[i]` is the time for
-            `rows[i]` rows.
+        phases: For each kind of cost, the pair (rows, seconds). `rows` are numbers of tokens, increasing. A forward
+            or draft over `rows[i]` tokens takes `seconds[i]`.
         tokens: Number of tokens N in a chunk.
         about: What was measured: target, machine, versions.
     """
@@ -72,10 +72,14 @@ class Profile:
         return float(self.times(kind, np.array([rows]))[0])
 
     def times(self, kind: str, rows: np.ndarray) -> np.ndarray:
-        """Return the seconds (n,) of n forwards or drafts of this kind, over `rows` (n,) rows each.
+        """Return the seconds (n,) of n forwards or drafts of this kind.
 
-        Between the measured numbers of rows, the seconds are interpolated linearly. Beyond the largest one they are
-        extrapolated linearly.
+        Between the measured numbers of tokens, the seconds are interpolated linearly. Beyond the largest number they
+        are extrapolated linearly.
+
+        Args:
+            kind: Kind of cost, such as `verify`.
+            rows: Number of tokens that each forward or draft processes, (n,).
         """
         measured, times = self.phases[kind]
         seconds: np.ndarray = np.interp(rows, measured, times)
@@ -126,8 +130,8 @@ class Calls(NamedTuple):
 
     Attributes:
         decode: (m,) index of the decode that made each call.
-        rows: (m,) number of tokens that each call processed, without the prompt's.
-        with_prompt: (m,) bool, whether the call processed the prompt's tokens, too.
+        rows: (m,) number of tokens that each call processed, not counting the prompt's tokens.
+        with_prompt: (m,) bool, whether the call also processed the prompt's tokens.
     """
 
     decode: np.ndarray
@@ -137,14 +141,14 @@ class Calls(NamedTuple):
 
 @dataclass(frozen=True)
 class Work:
-    """What several decodes computed: forwards, drafts, and recorded seconds of everything else.
+    """What several decodes computed: forwards and drafts, and the recorded seconds of everything else.
 
     Attributes:
-        calls: The forwards and drafts whose cost depends on the target's size, by kind (one of `FORWARDS`).
-        sources: For each kind of draft whose cost does not depend on the target's size, such as `retrieval`: (decodes,)
-            bool, whether the decode used a proposer of this kind.
+        calls: The forwards and the drafter's drafts, by kind of cost (one of `FORWARDS`).
+        sources: Drafts of other proposers, by kind of cost, such as `retrieval`. For each kind, (decodes,) bool:
+            whether the decode used a proposer of this kind.
         host: (decodes,) recorded seconds that neither depend on the target's size nor were spent on drafting.
-        propose: (decodes,) recorded seconds of drafting. 0 if the drafter drafted, because its cost is in `calls`.
+        propose: (decodes,) recorded seconds of drafting. 0 if the drafter drafted, because `calls` holds its drafts.
     """
 
     calls: Mapping[str, Calls]
@@ -168,8 +172,8 @@ def work_of(
     """Return what several decodes computed, from the columns of their records.
 
     Args:
-        rounds: Values (n,) over the n rounds of all decodes, for each of the `Round` attributes mode, proposer, start,
-            tree_size, accepted and levels.
+        rounds: One array (n,) for each of the attributes of `Round` that `COUNTED` names. Its values are those of the n
+            rounds of all decodes, in order.
         counts: Number of rounds of each decode, (decodes,).
         phases: Recorded seconds of each of `READ_PHASES`, (decodes,).
         looked_up: Whether the decode searched the datastore, (decodes,) bool.
@@ -223,8 +227,8 @@ def work_of_record(decode: DecodeRecord) -> Work:
 def prices(work: Work, profile: Profile) -> np.ndarray:
     """Estimate the seconds of each decode, (decodes,).
 
-    The seconds of forwards, and of everything that the drafter computes, are those in the profile. So are the seconds
-    of other proposers' drafts, if the profile has them. Everything else takes the seconds that were recorded.
+    Forwards and the drafter's drafts take the profile's seconds. Other proposers' drafts do so, too, if the profile
+    has their times. Everything else takes its recorded seconds.
     """
     total = np.array(work.host, dtype=float)
     for kind, (decode, rows, with_prompt) in work.calls.items():

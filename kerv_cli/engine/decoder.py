@@ -102,7 +102,7 @@ class Decoder(ActionDecoder):
 
     @cached_property
     def autoregressive(self) -> Decoder:
-        """An autoregressive decoder of the same target. The method's actions are compared with its actions."""
+        """An autoregressive decoder of the same target, which `decode` uses to measure the deviation."""
         return Decoder(self.target, chunk=self.steps)
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
@@ -304,8 +304,8 @@ class Decoder(ActionDecoder):
         """Commit the accepted path and, if the chunk has room, the bonus: the target's next token.
 
         Returns:
-            The target's hidden states from this forward, (1, before + accepted, E): of the tokens ahead of the draft,
-            whose number is `before`, and of the accepted draft tokens.
+            The target's hidden states (1, b + a, E) from this forward. The first b belong to the tokens before the
+            draft, the other a to the accepted draft tokens.
         """
         tree, target_tokens, (path, rejected) = verified.tree, verified.target_tokens, accepted
         if proposer is None or not len(tree):
@@ -335,7 +335,7 @@ class Decoder(ActionDecoder):
         return self._keep(chunk, verified, list(path))
 
     def _keep(self, chunk: Chunk, verified: Verified, rows: list[int]) -> Tensor:
-        """Remove rejected draft tokens from the cache. Return the forward's hidden states without theirs.
+        """Remove rejected draft tokens from the cache. Return the hidden states of all other tokens of the forward.
 
         Args:
             chunk: The chunk, whose cache is changed.

@@ -29,7 +29,7 @@ class Draft:
         tokens: (n,) int64.
         parents: Index of each token's parent, (n,) int64; −1 is the last committed token. None for a chain.
         levels: Maximum depth of the tree. Needed only when `parents` is on the GPU.
-        paths: `ancestors` of a tree, if they are known already.
+        paths: The mask `ancestors`, if the proposer has computed it already. None: computed when it is first read.
     """
 
     tokens: Tensor
@@ -51,10 +51,10 @@ class Draft:
         return self.tokens.shape[0]
 
     def check(self, vocabulary: int, proposer: str, depth: int) -> None:
-        """Refuse a draft that cannot be verified.
+        """Raise an error if the draft cannot be verified.
 
-        Tokens on the GPU are not checked: each is an argmax, which is always in range. A tree on the GPU counts as deep
-        as its `levels`.
+        Tokens on the GPU are not checked: each is an argmax, which is always in range. The depth of a tree on the GPU
+        is taken from `levels`.
 
         Args:
             vocabulary: Number of action tokens.
@@ -62,8 +62,8 @@ class Draft:
             depth: Maximum number of tokens on a path.
 
         Raises:
-            KervError: A token is out of range, a path is too long, or a tree on the GPU has no `levels`. Or tokens and
-                parents are on two devices.
+            KervError: A token is out of range, a path is too long, a tree on the GPU has no `levels`, or tokens and
+                parents are on different devices.
         """
         device, is_chain = self.tokens.device, self.parents is None
         if self.parents is not None and self.parents.device != device:
@@ -139,9 +139,9 @@ class Draft:
         return torch.cat([torch.arange(start, stop, device=device), stop + depths])
 
     def visible(self, before: int) -> np.ndarray | Tensor | None:
-        """Return the attention mask of a verification: which of its tokens each token attends to.
+        """Return the attention mask of a verification, (before + n, before + n) bool. None for a causal mask.
 
-        The mask is (before + n, before + n) bool, or None for a causal mask.
+        Entry [i, j] says whether token i of the forward attends to token j.
 
         Args:
             before: Number of tokens that are forwarded before the draft. Their attention is causal.

@@ -29,7 +29,12 @@ class Buildable(ABC):  # noqa: B024 - its subclasses are the interfaces
 
     @classmethod
     def build(cls, settings: Any, context: Any) -> Any:
-        """Return the part that these settings choose; arguments as the constructor. None: the method needs no part."""
+        """Return the part that these settings choose, or None if the method needs no such part.
+
+        Args:
+            settings: Settings of the part.
+            context: The `Context` (`kerv_cli/methods/context.py`): target, artifacts, task, parts built so far.
+        """
         return cls(settings, context)
 
     def similarity(self, chunk: Chunk) -> float | None:
@@ -70,7 +75,7 @@ class Fixed(Threshold):
         """Build the threshold with the radius `settings.r`.
 
         Raises:
-            UsageError: The radius is larger than the distance of any two tokens.
+            UsageError: The radius is larger than the largest distance between two tokens.
         """
         context.check_radius("r", settings.r)
         return cls(settings.r)
@@ -104,8 +109,8 @@ class Rectifier(Buildable):
         """Predict the missing values of the rejected control step.
 
         Returns:
-            The predicted values. None if they cannot be predicted: then the target decodes on after its own token at
-            the rejected position.
+            The predicted values. None if they cannot be predicted. Then the target goes on decoding after its own token
+            at the rejected position.
         """
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Proposer(Buildable):
-    """Base class of proposers: drafts a tree of tokens that continue the committed ones.
+    """Base class of proposers. A proposer drafts a tree of tokens that continue the committed tokens.
 
     Attributes:
         name: Name in the records, e.g. `drafter`.
@@ -42,9 +42,10 @@ class Proposer(Buildable):
         Args:
             chunk: The chunk, which already holds the round's committed tokens.
             first: Index in the chunk of the token just before this round's tokens. `hidden` starts with this token.
-            hidden: The target's hidden states (1, T, E), each E wide, of the chunk's tokens first … first + T − 1.
-            target_tokens: The target's prediction after token `first`, then after each of the draft's n nodes, rejected
-                ones included.
+            hidden: The target's hidden states (1, T, E) of T tokens of the chunk, with indices first … first + T − 1.
+                E is the target's width.
+            target_tokens: 1 + n tokens: the target's prediction after token `first`, then after each of the draft's n
+                nodes. Rejected nodes are included.
         """
 
 

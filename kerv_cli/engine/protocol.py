@@ -134,9 +134,9 @@ class PredictsTokens(Protocol):
 
         Args:
             tokens: The new tokens (T,) int64.
-            positions: As in `Target.forward`, like `cache` and `seen`.
-            cache: From `new_cache`.
-            seen: Attention mask. None for a causal mask.
+            positions: Position of each new token in the sequence (T,), for the positional encoding.
+            cache: From `new_cache`. The new tokens attend to all cached tokens and are added to them.
+            seen: Attention mask (T, T) bool: whether new token i attends to new token j. None for a causal mask.
 
         Returns:
             The most probable token after each new token, (T,) int64, and their hidden states (1, T, E).
@@ -145,15 +145,15 @@ class PredictsTokens(Protocol):
 
 @runtime_checkable
 class JoinsDrafters(Protocol):
-    """A target that can run its layers together with a drafter's, and whose enlargement a drafter can follow."""
+    """A target that can be compiled together with a drafter, and that can enlarge a small policy's drafter."""
 
     def join(self, function: Callable[..., Any], *shapes: tuple[int, ...], repeats: bool = False) -> Any:
         """Compile a function that calls modules of the target and of a compiled drafter.
 
         Args:
-            function: The function, of float32 tensors of batch size 1.
-            shapes: Shape of each of its inputs.
-            repeats: Whether its outputs can be its next inputs.
+            function: The function. Its inputs are float32 tensors of batch size 1.
+            shapes: Shape of each input.
+            repeats: Whether the outputs of one call can be the inputs of the next call.
 
         Returns:
             The compiled program. None if the target is not compiled.
@@ -167,7 +167,7 @@ class JoinsDrafters(Protocol):
 
 
 class ReadableTarget(Target, Protocol):
-    """A target that also describes its prompt and the shape of its layers. Drafters and the datastore need both."""
+    """A target that also describes its prompt and the shape of its layers, for drafters and the datastore."""
 
     @property
     def segments(self) -> Mapping[str, slice]:

@@ -40,7 +40,8 @@ class Round:
         committed: Number of committed tokens: the accepted ones and the bonus.
         tree_size: Number of draft tokens in the verified tree.
         threshold: Largest accepted distance per DoF, in bins. Empty if no acceptance rule ran.
-        levels: Depth down to which a tree was drafted; its kept nodes may be less deep. 0 for a chain.
+        levels: Number of levels that were drafted for a tree. The nodes that were kept may reach fewer levels. 0 for a
+            chain.
     """
 
     mode: str
@@ -56,7 +57,7 @@ class Round:
 
     @property
     def drafter(self) -> str:
-        """The proposer, or the mode of a round without verification: skip or parallel. Empty if nothing drafted."""
+        """Name of the proposer that drafted; empty without a draft. The mode, if it is `skip` or `parallel`."""
         if self.mode in ("skip", PARALLEL):
             return self.mode
         return "" if self.proposer == "none" else self.proposer
@@ -137,8 +138,8 @@ class Measure:
     """How the kinematic variability K of a decode is computed (docs/methods.md §3.2).
 
     Attributes:
-        accepted: Whether only accepted draft tokens count. Else the rejected token after them counts, too.
-        total: Whether K is the sum of the differences. Else it is their mean.
+        accepted: True if only accepted draft tokens count. False if the rejected token after them counts, too.
+        total: True if K is the sum of the differences, False if it is their mean.
     """
 
     accepted: bool = False
@@ -146,7 +147,7 @@ class Measure:
 
     @property
     def name(self) -> str:
-        """Name in a calibration, such as `mean of compared`."""
+        """Name of the measure in a calibration, such as `mean of compared`."""
         return f"{'sum' if self.total else 'mean'} of {'accepted' if self.accepted else 'compared'}"
 
 
@@ -206,7 +207,7 @@ class EpisodeRecord:
     frames: dict[int, np.ndarray] = field(default_factory=dict)  # control step -> (h, w, 3) uint8, if recorded
     closest_approach: float = math.nan  # least distance of fingertips to object, metres; NaN: unknown
     object_moved: float = math.nan  # largest motion of the object after the fingertips came near, metres; NaN: unknown
-    wall_seconds: float = 0.0  # of the whole episode, with simulation and rendering; in a batch, its share
+    wall_seconds: float = 0.0  # whole episode, with simulation and rendering; in a batch, an equal share of its time
     places: dict[str, np.ndarray] = field(default_factory=dict)  # object, goal, … -> (T + 1, 3) metres, if recorded
 
     @property
