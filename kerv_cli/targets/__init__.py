@@ -15,9 +15,9 @@ class TargetPart(Part):
 
     Args:
         importer: Function that `kerv build target` calls with its settings. None: targets of this family are trained.
-        check_weights: Function of a folder and its description. It checks weights that are elsewhere. None: the weights
-            are in the folder.
-        images_alone: Whether its targets read images but no state.
+        check_weights: Function (folder, description) that checks weights stored outside the target's folder. None: the
+            weights are in the folder.
+        images_alone: Whether targets of this family read images, but no state of the robot.
     """
 
     kind = "target"

@@ -1,6 +1,6 @@
 """The key/value cache of a trunk, attention and its masks, rotary position embeddings, and CUDA graphs of a forward.
 
-A slot is the place of one token's keys and values in the cache.
+A slot of the cache holds the keys and values of one token.
 
 Shapes: B batch, T new tokens, S cached tokens, A heads (of keys and values), C channels of a head.
 """
@@ -34,8 +34,8 @@ class Cache:
         buffer: (layers, 2, B, A, slots, C) keys and values. A fixed cache has a spare slot after its capacity.
         layers: (2, B, A, slots, C) per layer, views of the buffer.
         length: Number of cached tokens. They are in the first slots.
-        copied: Number of slots that `copies` holds as they are in the buffer. It may exceed `length`: slots from there
-            on are written anew before they are read.
+        copied: Number of slots, from the first on, whose `copies` equal the buffer. It may exceed `length`, because
+            later slots are overwritten before they are read.
     """
 
     def __init__(
@@ -50,11 +50,13 @@ class Cache:
         self._copies: tuple[np.ndarray, np.ndarray] | None = None
 
     def copies(self, width: int) -> tuple[np.ndarray, np.ndarray, int]:
-        """Return memory for copies of keys and values in panels `width` slots or channels wide, for compiled programs.
+        """Return the memory in which compiled programs keep copies of keys and values.
+
+        The copies are stored in panels, which are blocks of `width` slots (keys) or `width` channels (values).
 
         Returns:
-            The keys (layers, B · A, panels, C, width) and the values (layers, B · A, panels, slots, width); and the
-            number of the first slots that they hold already.
+            The keys (layers, B · A, panels, C, width), the values (layers, B · A, panels, slots, width), and the number
+            of slots, from the first on, that these arrays hold already.
         """
         if self._copies is None:
             layers, _, batch, heads, slots, channels = self.buffer.shape
@@ -166,7 +168,7 @@ _WARM_UP = 3  # runs before a capture, in which libraries choose kernels and all
 
 
 def bucket(tokens: int) -> int:
-    """Return the number of rows of the smallest graph that holds this many tokens.
+    """Return the number of tokens of the smallest CUDA graph that can process `tokens` tokens.
 
     It is a power of two up to 16, then a multiple of 16.
     """
@@ -183,11 +185,11 @@ class CapturedCache(Cache):
     """A key/value cache of fixed shapes, with CUDA graphs that run a forward through all layers in one launch.
 
     A graph takes a fixed number of tokens, called its bucket (1, 2, 4, 8, 16, 32, 48, …). A forward of T tokens runs in
-    the smallest bucket that holds them. The unused rows read zeros and write to the spare slot, which no other row
-    attends to. The batch size is 1. On a CPU the same computation runs without graphs, for tests.
+    the smallest bucket that is large enough. Its unused tokens read zeros and write to the spare slot, which no other
+    token attends to. The batch size is 1. On a CPU the same computation runs without graphs, for tests.
 
     Attributes:
-        steps: The graphs, by their number of rows (bucket). Empty before the first forward.
+        steps: The graphs, by bucket. Empty before the first forward.
     """
 
     def __init__(self, layers: int, batch: int, heads: int, capacity: int, channels: int, like: Tensor) -> None:

@@ -288,7 +288,12 @@ def read_description(folder: Path, kind: str, schema: type[T]) -> T:
 
 
 def described(folder: Path, kind: str, schema: type[T]) -> T:
-    """Return the description of an artifact without checking its weights; arguments as `read_description`.
+    """Return the description of an artifact without checking its weights.
+
+    Args:
+        folder: Folder of the artifact.
+        kind: Kind of artifact, such as `drafter`.
+        schema: Dataclass of the description.
 
     Raises:
         CheckpointError: The description is missing, damaged or of another version of kerv.
@@ -347,10 +352,14 @@ def load_state(module: nn.Module, folder: Path, kind: str) -> None:
 
 
 def read_target(folder: Path) -> TargetDescription:
-    """Return the description of a target and check its weights; errors as `read_description`.
+    """Return the description of a target, and check its weights.
 
-    A family of targets whose weights are not in the target's folder registers a check of its own
+    A family of targets whose weights are not in the target's folder registers its own check
     (`TargetPart.check_weights`).
+
+    Raises:
+        CheckpointError: The description or the weights are missing, damaged or of another version of kerv, or they do
+            not belong together.
     """
     description = described(folder, "target", TargetDescription)
     family = TargetPart.every().get(description.family)

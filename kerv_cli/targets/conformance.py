@@ -25,10 +25,10 @@ TOLERANCE = {torch.float64: 1e-6, torch.float32: 2e-4, torch.bfloat16: 0.2, torc
 MEMBERS = ("actions", "chunk", "cameras", "width", "max_prompt", "device")
 METHODS = ("encode", "embed", "new_cache", "forward", "head")
 TREE = Draft.of([0] * 7, [-1, 0, 0, 1, 1, 2, 4])
-"""A draft tree, of which only the shape is used."""
+"""A draft tree for the checks. Its tokens do not matter, only its shape."""
 Pairs = Iterable[tuple[Tensor, Tensor]]
-"""Pairs of hidden states (…, E): computed as the engine does it, and as expected. Their logits must be equal, up to
-rounding."""
+"""Pairs of hidden states (…, E): first as the engine computes them, then as expected. The logits of both must be equal
+up to rounding."""
 
 
 @torch.inference_mode()

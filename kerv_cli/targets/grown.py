@@ -156,7 +156,17 @@ def check_weights(folder: Path, description: TargetDescription) -> None:
 
 
 def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> CompactTarget:
-    """Load the policy that the recipe names, and enlarge its trunk; arguments as `compact.folder.build`."""
+    """Load the policy that the recipe names, and enlarge its trunk.
+
+    Args:
+        folder: Folder of the grown target.
+        description: The content of its `target.json`, which holds the recipe.
+        device: Device to load the target to.
+        dtype: Number format to convert the weights to.
+
+    Raises:
+        CheckpointError: The policy is missing, or the weights do not fit it.
+    """
     recipe = recipe_of(description)
     base = Path(recipe.base)
     target = build_compact(base, checkpoint.read_target(base), device, dtype)
@@ -188,7 +198,7 @@ def grow(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
         The target's folder, and numbers to print by name, such as the number of weights.
 
     Raises:
-        UsageError: The policy is no compact target, or it does not fit into the new shape.
+        UsageError: The policy is not a compact target, or it is larger than the new shape.
     """
     base = find_target(settings.results, settings.base).resolve()
     description = checkpoint.read_target(base)

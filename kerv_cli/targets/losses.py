@@ -1,6 +1,6 @@
 """Training losses of targets and drafters.
 
-Shapes: B samples, N tokens of a chunk, V possible tokens, K places.
+Shapes: B samples, N tokens of a chunk, V possible tokens, K places (object, goal, …) whose positions are estimated.
 """
 
 from __future__ import annotations

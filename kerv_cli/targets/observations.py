@@ -30,7 +30,10 @@ BATCH = 64
 
 @runtime_checkable
 class LocatesPlaces(Protocol):
-    """A target that takes observations as tensors, and estimates where object and goal are. A scout needs both."""
+    """A target that takes observations as tensors, and estimates the positions of object and goal.
+
+    The scout, a drafter with its own vision encoder, is trained with such a target.
+    """
 
     words: WordTokenizer
     settings: TargetSettings
@@ -40,7 +43,7 @@ class LocatesPlaces(Protocol):
         """Return an observation as tensors on the target's device, a batch of one."""
 
     def encode_batch(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
-        """Return prompts (B, P, E), and the estimated positions (B, K, 3) of the K places, in metres."""
+        """Return prompts (B, P, E), and the estimated positions (B, K, 3) in metres of K places (object, goal, …)."""
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ def provenance_of(command: str, settings: Any, device: str, **figures: Any) -> d
 
 
 def stamp(device: str) -> dict[str, str]:
-    """Return host, device, versions and commit as strings, by the name of the table's column."""
+    """Return host, device, versions and commit as strings, by the column's name in the table of episodes."""
     numbers = {f"{name}_version": number for name, number in versions().items()}
     return {"host": socket.gethostname(), "device_name": device_name(device), **numbers, "git_commit": git_commit()}
 

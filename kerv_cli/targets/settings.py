@@ -55,7 +55,7 @@ class BuildTargetSettings(RunSettings):
             prefix: Start of the settings' names in error messages.
 
         Raises:
-            UsageError: Something else than a checkpoint of OpenVLA is to be compared with transformers.
+            UsageError: `check` is set, but the target is not made from an OpenVLA checkpoint.
         """
         if self.check and (self.family != "openvla" or self.grow.width):
             raise UsageError(f"{prefix}check=true compares checkpoints of OpenVLA: name one with checkpoint=DIR")

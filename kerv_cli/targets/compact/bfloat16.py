@@ -1,10 +1,10 @@
 """Matrices that a CPU multiplies in bfloat16 in hardware (AMX, AVX512-BF16), for the large layers of a `Program`.
 
 Weights are stored in the blocked layout of oneDNN, the library that torch uses for matrix multiplications on a CPU. One
-row and thirty rows then take almost the same time, because most of the time is spent on reading the weights. All other
+token and thirty tokens then take almost the same time, because most time is spent on reading the weights. All other
 operations of a program are float32. They are cheap, and rounding them would more often make the two best logits almost
-equal. oneDNN adds in a different order for one row than for many, so the last bit of a result depends on the number of
-rows (docs/measuring.md).
+equal. oneDNN adds in a different order for one token than for many, so the last bit of a result depends on the number
+of tokens (docs/measuring.md).
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 LARGE = 2**19
-"""A bfloat16 matrix with at least this many weights is stored in oneDNN's layout. For smaller ones the call of oneDNN
-would take longer than it saves: the program multiplies them itself."""
+"""A bfloat16 matrix with at least this many weights is stored in oneDNN's layout. The program multiplies smaller ones
+itself, because calling oneDNN would take longer than it saves."""
 ROWS = 32  # oneDNN chooses the layout for this many rows; 154 M weights take 27 ms for 1 row, 33 for 31, 41 for 47
 
 

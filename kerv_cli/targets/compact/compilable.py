@@ -40,7 +40,7 @@ class Compilable(nn.Module):
         return None
 
     def runs_compiled(self, x: Tensor) -> bool:
-        """Return whether to use the compiled form for the input `x`: it exists, and no gradients are needed."""
+        """Return whether to use the compiled form for `x`: True if it exists and no gradients are needed."""
         return self.compiled is not None and isinstance(x, Tensor) and not wants_gradient(x)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
@@ -67,7 +67,7 @@ class CompilableLinear(Compilable, nn.Linear):
         return Program(super().forward, (1, self.in_features)) if self.weight.dtype in FORMATS else None
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map inputs (…, in_features) to outputs (…, out_features). Those of the compiled form are float32."""
+        """Map inputs (…, in_features) to outputs (…, out_features). The compiled form returns float32."""
         return self.compiled(x)[0].view(*x.shape[:-1], -1) if self.runs_compiled(x) else super().forward(x)
 
 

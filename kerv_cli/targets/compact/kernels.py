@@ -303,7 +303,7 @@ def attention(frames, out, qkv, tables, cache, start, filled, mask, keys, values
 
 @compiled
 def sum_of_exponentials(x, most):
-    """Return the sum of e^(x − most)."""
+    """Return the sum of e^(x[i] − most) over all elements of the array `x`. `most` is the largest element."""
     total = _ZERO
     for i in range(len(x)):
         total += exponential(x[i] - most)
@@ -404,7 +404,7 @@ def elementwise(code, frame, columns, numbers, indices):
 def ranked(values, best):
     """Fill `best` (n,) with the indices of the n greatest values, in falling order. Equal values stay in their order.
 
-    There must be n values above minus infinity.
+    At least n values must be above minus infinity.
     """
     held, count = np.empty(len(best), np.float32), len(best)
     for i in range(count):
@@ -431,10 +431,11 @@ def branch(frames, columns, time, start, mask, results):
         columns: The operation's line in the table of operations.
         time: Number of earlier executions.
         start: Slot of the first drafted node in the cache.
-        mask: (k, slots), 0 for slots that a node sees. Afterwards those that the new nodes see.
-        results: (times, 4, k²). Of every child of this level: its token, its parent, and the sum of the logarithms of
-            the probabilities on its path; then the indices of the k best children in the level. A parent is an index
-            among all children so far, −1 for the root. The first level has only k children.
+        mask: (k, slots), 0 for slots that a node sees. Afterwards 0 for slots that the new nodes see.
+        results: (times, 4, k²), of which this call fills `results[time]`. Its first three rows hold the token of each
+            child in this level, the child's parent, and the sum of the log-probabilities on the child's path. Its
+            fourth row holds the indices of the k best children in this level. A parent is an index among all children
+            so far, −1 for the root. The first level has only k children.
     """
     nodes, out, a, b = len(frames), columns[1], columns[2], columns[3]
     width, hidden, rows = columns[5], columns[6], nodes if time else 1
@@ -491,7 +492,8 @@ def run(ops, begin, end, last, indices, numbers, frames, positions, start, cache
         values: (layers, B · A, panels, slots, PANEL) copy of the values.
         filled: Number of slots that `keys` and `values` hold already.
         mask: (T, start + T · times), 0 for slots that a row sees. Shape (0, 1) means that attention is causal.
-        results: (times, 1, B · T), filled with the result of ARGMAX in each execution; or those of `branch`.
+        results: (times, 1, B · T), filled with the result of ARGMAX in each execution. For programs that draft a tree
+            (times, 4, k²), filled by `branch`.
     """
     rows, size = frames.shape
     tokens, memory, channels = len(positions), frames.ctypes.data, cache.shape[5]
@@ -535,12 +537,12 @@ def run(ops, begin, end, last, indices, numbers, frames, positions, start, cache
     types.Tuple((_I[::1], _I[::1], types.boolean[:, ::1]))(_F[:, :, ::1], _I, _I), error_model="numpy", cache=True
 )
 def best(results, top_k, nodes):
-    """Choose the nodes of EAGLE-2's tree: the most probable of all, at equal probabilities the first ones.
+    """Choose the most probable nodes as EAGLE-2's tree. Of equally probable nodes it takes the first ones.
 
-    They form a tree, because a child is never more probable than its parent, which comes before it.
+    The chosen nodes form a tree, because a child is never more probable than its parent and comes after it.
 
     Args:
-        results: What `branch` found in all executions.
+        results: (times, 4, k²), filled by `branch` in all executions.
         top_k: Number of children of a node.
         nodes: Number of nodes to choose, at most.
 

@@ -36,9 +36,9 @@ _LOG = logging.getLogger("kerv")
 
 
 def own_folder() -> Path:
-    """Return a temporary folder that only this user can write: the code in it is run.
+    """Return a temporary folder that only this user can write, because kerv runs the code in it.
 
-    It is the same in every process of the user. If another user has taken its name, it is a new one.
+    All processes of the user get the same folder. If another user has a folder of that name, a new one is made.
     """
     folder = Path(tempfile.gettempdir(), f"kerv-{os.getuid()}")
     with contextlib.suppress(FileExistsError):
@@ -136,7 +136,7 @@ def matrix_of(weight: Tensor, bias: Tensor | None) -> Matrix:
 
 
 def stored_bytes(tensors: Iterable[Tensor]) -> float:
-    """Return how many bytes weights take where they are read: those of a program in its stored format."""
+    """Return the bytes of memory that these weights take. Weights of a program count in its stored number format."""
     return float(sum(_MATRICES[x].nbytes if x in _MATRICES else x.nbytes for x in tensors))
 
 
@@ -237,7 +237,7 @@ class Program:
         """Draft EAGLE-2's dynamic tree in one call. Every execution of the program adds a level.
 
         At each level, the `top_k` nodes with the highest cumulative log-probability get `top_k` children each. In the
-        end the most probable nodes of all are kept. At equal probabilities the first ones count.
+        end the most probable nodes of all are kept. Of equally probable nodes the first ones are kept.
 
         Args:
             levels: Maximum number of tokens on a path.
@@ -249,8 +249,8 @@ class Program:
                 stays as it is.
 
         Returns:
-            Tokens (n,), parents (n,), −1 for the root, and the mask (n, n) bool of each node's path, as in
-            `Draft.ancestors`.
+            Tokens (n,), parents (n,) with −1 for the root, and the mask (n, n) bool: entry [i, j] says whether node j
+            is node i or one of its ancestors.
         """
         results = np.empty((levels, 4, top_k * top_k), np.float32)
         mask = torch.ones(top_k, cache.length + levels * top_k)

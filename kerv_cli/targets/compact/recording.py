@@ -118,7 +118,7 @@ class Recorded:
         return self.tape.emit(ARGMAX, (1,), [self], self.place.numel())
 
     def branch(self, hidden: Recorded) -> tuple[Recorded, Recorded]:
-        """Grow a level of a draft tree. `Program.grow` explains what this operation of all rows computes.
+        """Record the operation that grows one level of a draft tree; see `Program.grow`.
 
         Args:
             hidden: (…, E) hidden state of a row's node. This value has the logits of the node's children.

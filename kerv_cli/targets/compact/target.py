@@ -68,7 +68,8 @@ class Programs(NamedTuple):
 
     Attributes:
         prompt: Program that encodes a prompt.
-        step: Program from tokens to the tokens after them and the hidden states. It can be repeated.
+        step: Program that reads tokens, and returns the most probable next tokens and the hidden states. It can be
+            repeated.
     """
 
     prompt: Program
@@ -315,7 +316,16 @@ class CompactTarget(Compilable):
         return Programs(Program(self.prompt, *shapes), Program(step, (1, 1), repeats=True))
 
     def join(self, function: Callable[..., Any], *shapes: tuple[int, ...], repeats: bool = False) -> Program | None:
-        """Compile a function of the target's and a drafter's modules; see `JoinsDrafters.join`."""
+        """Compile a function that calls modules of the target and of a compiled drafter.
+
+        Args:
+            function: The function. Its inputs are float32 tensors of batch size 1.
+            shapes: Shape of each input.
+            repeats: Whether the outputs of one call can be the inputs of the next call.
+
+        Returns:
+            The compiled program. None if the target is not compiled.
+        """
         return Program(function, *shapes, repeats=repeats) if self.compiled is not None else None
 
     def enlarge(self, drafter: Any) -> None:
@@ -331,13 +341,19 @@ class CompactTarget(Compilable):
         return self.embedding(tokens)
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
-        """Return an empty key/value cache; arguments as `LayerStack.new_cache`."""
+        """Return an empty key/value cache.
+
+        Args:
+            batch: Number of sequences.
+            capacity: Maximum number of tokens.
+            fixed: Whether every forward attends to all slots, so that its shapes are fixed. None: only on CUDA.
+        """
         return self.trunk.new_cache(batch, capacity, fixed)
 
     def forward(
         self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
-        """Return the hidden states (B, T, E) of embeddings x (B, T, E); arguments as `Trunk.forward`."""
+        """Return the hidden states (B, T, E) of embeddings x (B, T, E). `Trunk.forward` explains the arguments."""
         return self.trunk(x, positions, cache, seen)
 
     def continue_greedily(self, token: int, count: int, cache: Cache) -> list[int] | None:
@@ -360,9 +376,16 @@ class CompactTarget(Compilable):
     def predict(
         self, tokens: Tensor, positions: Tensor, cache: Cache, seen: np.ndarray | Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Read T new tokens, and return the most probable token after each (T,) and their hidden states (1, T, E).
+        """Read T new tokens. A compiled target does this in one call.
 
-        A compiled target needs one call for it. `Trunk.forward` explains the other arguments.
+        Args:
+            tokens: The new tokens (T,) int64.
+            positions: (T,) rotary positions of the new tokens.
+            cache: Keys and values of earlier tokens. Those of the new tokens are appended.
+            seen: Which tokens each new token attends to, as in `attention_mask`. None: attention is causal.
+
+        Returns:
+            The most probable token after each new token, (T,) int64, and their hidden states (1, T, E).
         """
         if self.compiled is None or cache.fixed:
             hidden = self(self.embed(tokens[None]), positions, cache, seen)

@@ -165,8 +165,8 @@ class Bounds:
     Attributes:
         q01: 1st percentile of the actions.
         q99: 99th percentile of the actions.
-        mask: Which DoFs are normalised with the percentiles. Others, such as the gripper, are used as they are. None
-            means all.
+        mask: Which DoFs are normalised with the percentiles. The others, such as the gripper, are not normalised. None:
+            all DoFs are normalised.
     """
 
     q01: tuple[float, ...]
@@ -216,7 +216,7 @@ def action_space(shape: Shape, bounds: Bounds, like: ActionSpace | None, control
         control_hz: Control steps per second if `like` is None.
 
     Raises:
-        CheckpointError: The statistics have a different number of DoFs, or the same percentiles for a DoF.
+        CheckpointError: The statistics have a different number of DoFs, or both percentiles of a DoF are equal.
     """
     from kerv_cli.base.spaces import ActionSpace, Group
 

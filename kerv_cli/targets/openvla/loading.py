@@ -164,7 +164,7 @@ def open_checked(folder: Path, shape: Shape) -> Shards:
 
 
 def load_model(folder: Path, shape: Shape, device: str, dtype: torch.dtype, int8: bool) -> OpenVLAModel:
-    """Load and freeze the model of a checkpoint; errors as `open_checked`.
+    """Load and freeze the model of a checkpoint.
 
     Args:
         folder: Folder of the checkpoint.
@@ -172,6 +172,9 @@ def load_model(folder: Path, shape: Shape, device: str, dtype: torch.dtype, int8
         device: Device to load it to.
         dtype: Number format to convert the weights to.
         int8: Whether to convert the layers of the language model to one byte per weight.
+
+    Raises:
+        CheckpointError: Files are missing or damaged, or tensors are missing, unknown or have a wrong shape.
     """
     shards = open_checked(folder, shape)
     with torch.device("meta"):

@@ -127,7 +127,7 @@ class Reference:
         return self._loaded(model, self._part("language_model."), strict=True)
 
     def patches(self, pixels: Tensor) -> Tensor:
-        """Map an image (1, 6, s, s) to vision tokens (1, n, E): towers before their final norm, then the projector."""
+        """Map an image (1, 6, s, s) to vision tokens (1, n, E): both towers without final norm, then the projector."""
         pixels = pixels.to(self.device, self.dtype)
         first = self.dino(pixels[:, :3], output_hidden_states=True).hidden_states[-1]
         second = self.siglip(pixels[:, 3:], output_hidden_states=True).hidden_states[-1]
@@ -177,9 +177,14 @@ def parity(target: Any) -> dict[str, float]:
         target: An `OpenVLATarget`. The reference has its device and number format, but is first made in float32.
 
     Returns:
-        Numbers by name: tokens that were compared; tokens that are not transformers' choice among the action tokens;
-        how many of these follow logits whose two largest tie in bfloat16; all such ties; tokens for which
-        transformers' choice among all ids is no action token; the largest difference of two logits.
+        Numbers by name, in this order:
+
+        - Tokens that were compared.
+        - Tokens that differ from transformers' most probable action token.
+        - Tokens among these whose two largest logits are equal in bfloat16.
+        - All tokens whose two largest logits are equal in bfloat16.
+        - Tokens for which transformers' most probable id is not an action token.
+        - Largest difference of two logits.
 
     Raises:
         UsageError: transformers is not installed.

@@ -100,7 +100,7 @@ class LlamaLayer(nn.Module):
     def forward(
         self, x: Tensor, rotary: Rotary, mask: Tensor | None, cache: Tensor | None = None, slots: Slots | None = None
     ) -> Tensor:
-        """Return the layer's output (B, T, E) for x (B, T, E); arguments as `LlamaAttention.forward`."""
+        """Return the layer's output (B, T, E) for x (B, T, E). `LlamaAttention.forward` explains the arguments."""
         x = x + self.self_attn(self.input_layernorm(x), rotary, mask, cache, slots)
         return x + self.mlp(self.post_attention_layernorm(x))
 
@@ -149,7 +149,7 @@ class LlamaModel(nn.Module):
     def forward(
         self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
     ) -> Tensor:
-        """Return the hidden states (B, T, E) of embeddings x (B, T, E); other arguments as `run_layers`."""
+        """Return the hidden states (B, T, E) of embeddings x (B, T, E). `run_layers` explains the arguments."""
         return self.norm(run_layers(self.layers, self.language, x, positions, cache, seen))
 
 
