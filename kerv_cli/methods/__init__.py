@@ -17,6 +17,8 @@ Each file above, and the `__init__.py` of each folder, contains the parts of its
 neither torch nor numpy when it is loaded. A drafter's network, and whatever else needs them, is in a file of its own,
 which is imported when the part is built.
 
+*Ours* marks what comes from no paper.
+
 `compose.py` builds a decoder from a method's parts. `context.py` is the context in which a part is built.
 `artifacts.py` finds, checks and loads files. `drafters.py` is the base of drafters with weights. `calibration.py` is
 the file of calibrated numbers that KERV and HeiSD share.

@@ -205,11 +205,11 @@ class Artifact(Generic[T]):
         return sha256_of(self.json(path))
 
     def read(self, path: Path) -> T:
-        """Read the description of the artifact in `path`, without checking its target.
+        """Read the description of the artifact in `path`, without checking which target it was made for.
 
         Raises:
-            CheckpointError: The description is missing, damaged or of another format. Or a file beside it has another
-                hash than the description names.
+            CheckpointError: The description is missing, damaged or of another format, or a file beside it does not have
+                the hash that the description names.
         """
         file = self.json(path)
         if not file.is_file():
@@ -220,8 +220,8 @@ class Artifact(Generic[T]):
         """Read the description in an existing file.
 
         Raises:
-            CheckpointError: The description is damaged or of another format. Or a file beside it has another hash than
-                the description names.
+            CheckpointError: The description is damaged or of another format, or a file beside it does not have the hash
+                that the description names.
         """
         try:
             description = read_file(self.schema, file)
@@ -234,8 +234,8 @@ class Artifact(Generic[T]):
         """Read the description of the artifact in `path`, and check that it was made for this target.
 
         Raises:
-            CheckpointError: The artifact is missing or damaged. Or it was made for another target, action space or
-                chunk length.
+            CheckpointError: The artifact is missing or damaged, or was made for another target, action space or chunk
+                length.
         """
         description = self.read(path)
         made_for, what = self.made_for(description), f"the {self.noun} in {path}"
@@ -275,11 +275,11 @@ class Artifacts:
 
         Args:
             kind: Kind of the artifact.
-            adds: Whether the command only adds to an artifact that is there, so that it may be a shipped policy's.
+            adds: Whether the command only adds to an existing artifact. This is allowed for a shipped policy, too.
 
         Raises:
-            UsageError: `policy.artifacts.KIND` is a path. A command writes only to the results folder, or to the folder
-                beside the target. Or an artifact of a shipped policy would be replaced.
+            UsageError: `policy.artifacts.KIND` is a path, which no command writes to, or an artifact of a shipped
+                policy would be replaced.
         """
         name = self.policy.artifacts.get(kind)
         if name:

@@ -43,8 +43,8 @@ class Variability:
     Attributes:
         k_s: Reference level K_S: the median K over the decodes that were measured, in normalised action units.
         decodes: Number of decodes that were measured.
-        levels: The median of every `Measure` of K, by its name. `k_s` is that of `MEAN`. Empty in calibrations before
-            version 1.1.
+        levels: Median of K for every way to compute it, by the name of the `Measure`. The median for `MEAN` is `k_s`.
+            Empty in calibrations before version 1.1.
     """
 
     k_s: float
@@ -183,7 +183,8 @@ class Calibration:
     def skip_levels(self, task: str, datastore: str) -> tuple[float, float, float]:
         """Return (low, s_min, high): the similarity s_min at which the task skips verification, and its bounds.
 
-        A skip rule may change s_min after each episode, within the bounds. All three are NEVER if the task never skips.
+        A skip rule may change s_min after each episode, within the bounds. If the task never skips, all three are
+        NEVER, which is above every similarity.
 
         Args:
             task: Full name of the task.
@@ -212,7 +213,7 @@ class CalibrationArtifact(Artifact[Calibration]):
     schema = Calibration
 
     def path(self, results: str, name: str | None, target: Path) -> Path:
-        """Return the path of the calibration with this name; without a name, of the target's calibration.
+        """Return the path of the calibration with this name. Without a name, return the path of the target's own.
 
         A shipped calibration is `pretrained/<name>/calibration.json`. One made by `kerv calibrate` is
         `artifacts/calibration/<name>/calibration.json`.

@@ -1,4 +1,4 @@
-"""A threshold that knows contact (*ours*; docs/methods.md §3.2): the acceptance radius shrinks near the object."""
+"""A threshold that shrinks the acceptance radius near the object (*ours*; docs/methods.md §3.2)."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class ContactThresholdSettings(RadiusRange):
 
 @ThresholdPart("contact", ContactThresholdSettings)
 class Contact(Threshold):
-    """The acceptance radius r is r_min at the object, r_max from a distance `near` on, and linear between.
+    """The acceptance radius r grows linearly from r_min at the object to r_max at the distance `near` and beyond.
 
-    The distance is that of the last observation that the policy encoded, in the decode before. The first decode of an
-    episode has r_min.
+    The distance from hand to object is the policy's estimate from the last observation that it encoded, in an earlier
+    decode. The first decode of an episode uses r_min.
     """
 
     def __init__(self, settings: ContactThresholdSettings, context: Context) -> None:

@@ -39,7 +39,7 @@ class Context:
         return self.artifact("calibration")
 
     def check_radius(self, name: str, r: int) -> None:
-        """Refuse an acceptance radius that is larger than the largest distance of two tokens.
+        """Refuse an acceptance radius that is larger than the largest distance between two tokens.
 
         Args:
             name: Name of the threshold's setting, for the error message.

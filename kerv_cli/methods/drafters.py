@@ -1,4 +1,4 @@
-"""Base of drafters with weights. One class trains, saves, loads and proposes (docs/extending.md)."""
+"""Base of drafters with weights. Each kind is one class that trains, saves, loads and proposes (docs/extending.md)."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ class TrainableDrafter(Artifact[DrafterDescription]):
 
         Args:
             network: The network to train.
-            target: The frozen target that it imitates.
+            target: The frozen target that the drafter imitates.
             batch: Some of the training examples.
             step: The optimisation step.
             settings: Settings of `kerv train drafter`: `drafter` for the drafter, `train` for the optimisation.
@@ -161,9 +161,9 @@ class TrainableDrafter(Artifact[DrafterDescription]):
 
         Args:
             network: The network.
-            target: The target that it imitates.
-            held_out: Examples from episodes that it was not trained on.
-            settings: As in `loss`.
+            target: The target that the drafter imitates.
+            held_out: Examples from episodes that the network was not trained on.
+            settings: Settings of `kerv train drafter`: `drafter` for the drafter, `train` for the optimisation.
         """
 
     @classmethod

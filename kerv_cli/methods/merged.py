@@ -95,7 +95,7 @@ class MergedProposer(ChainProposer):
             source.reset()
 
     def similarity(self, chunk: Chunk) -> float | None:
-        """Return the similarity that a source found, if one searched a datastore."""
+        """Return the similarity that a source found in a datastore. None if no source searched one."""
         found = [source.similarity(chunk) for source in (*self.sources, *self.fallback)]
         return next((value for value in found if value is not None), None)
 

@@ -53,7 +53,7 @@ class Candidate:
 
     @property
     def source(self) -> Any:
-        """Settings of the proposer whose drafts, made before the prefill, the skip rule executes."""
+        """Settings of the proposer that drafts before the prefill. The skip rule executes its drafts."""
         return _part_settings("prefill_draft", self.draft)
 
 

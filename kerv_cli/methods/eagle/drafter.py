@@ -63,7 +63,11 @@ class EagleNetwork(LayerStack):
         return self.fuse(torch.cat(inputs, -1))
 
     def draft_position(self, index: int) -> int:
-        """Return the rotary position for position `index` of the sequence (prompt included), where drafting begins."""
+        """Return the rotary position at which drafting begins.
+
+        Args:
+            index: Position of the first draft step in the sequence, counted from the prompt's beginning.
+        """
         return index
 
     def forward(
@@ -186,8 +190,8 @@ class DrafterProposer(Proposer):
         """Draft EAGLE-2's dynamic tree of at most `depth` tokens per path.
 
         At each depth, the `top_k` nodes with the highest cumulative log-probability get `top_k` children each. In the
-        end the most probable nodes of all are kept, `nodes` in number. They form a tree, because a child is never more
-        probable than its parent.
+        end the `nodes` most probable nodes are kept. They form a tree, because a child is never more probable than its
+        parent.
         """
         target, top_k, device, base = self.target, self.top_k, self.hidden.device, self.cache.length
         first = self.drafter.draft_position(base)
@@ -235,7 +239,7 @@ def _best(tokens: Tensor, parents: Tensor, scores: Tensor, nodes: int, depth: in
 
 @dataclass(frozen=True)
 class EagleExamples(Decodes):
-    """The n training examples of an EAGLE-style drafter. Shorter prompts are followed by zeros.
+    """The n training examples of an EAGLE-style drafter. Shorter prompts are padded with zeros.
 
     Attributes:
         lengths: (n,) int64, number of prompt tokens P.

@@ -61,7 +61,7 @@ class PublicShape:
 
 
 class DraftCache(Cache):
-    """Keys and values of a drafter, and the length of the prompt in `prompt`."""
+    """Keys and values of a drafter. The attribute `prompt` is the number of prompt tokens."""
 
     prompt = 0
 
@@ -87,7 +87,11 @@ class PublicDrafter(nn.Module):
         return DraftCache(*sizes, weight, weight.is_cuda if fixed is None else fixed)
 
     def draft_position(self, index: int) -> int:
-        """Return the rotary position for position `index` of the sequence (prompt included), where drafting begins."""
+        """Return the rotary position at which drafting begins.
+
+        Args:
+            index: Position of the first draft step in the sequence, counted from the prompt's beginning.
+        """
         return index - self.shape.skipped * (self.shape.convention.positions == "text")
 
     def forward(
@@ -115,12 +119,12 @@ class PublicDrafter(nn.Module):
         return run_layers(self.layers, self.shape.language, x, positions, cache, seen, mask)
 
     def prompt_mask(self, x: Tensor, cache: DraftCache | None, seen: np.ndarray | Tensor | None) -> Tensor:
-        """Return the additive attention mask for `mask=prompt`: it hides every key after the prompt's first P − 1, too.
+        """Return the additive attention mask for `mask=prompt`, which hides all keys but the prompt's first P − 1.
 
         Args:
             x: (B, T, E) inputs of the layers.
             cache: Keys and values of S earlier tokens. None: there are none, and x is the prompt.
-            seen: (T, M) bool, which of the last M keys each query may see apart from that. None: causal.
+            seen: (T, M) bool, which of the last M keys each query may see. Others are also hidden. None: causal.
 
         Returns:
             (T, S + T): 0 for visible keys, −∞ for hidden keys.

@@ -182,7 +182,7 @@ class EarlyProposer(ChainProposer):
         self._drafted: tuple[Chunk, list[int], float] | None = None  # the last chunk, its draft, and the estimate
 
     def compile(self) -> Program | None:
-        """Return a program from a radius (1, 1) and a prompt to the result of `row`. None if a part is not compiled."""
+        """Return a program that computes `row` from a radius (1, 1) and a prompt. None if a part is not compiled."""
         early: Any = self.early
         target: Any = self.target
 
@@ -222,7 +222,7 @@ class EarlyProposer(ChainProposer):
 
 @dataclass(frozen=True)
 class EarlyExamples(Decodes):
-    """The n training examples of an early drafter."""
+    """The n training examples of an early drafter: pooled prompts, and the target's tokens."""
 
     features: Tensor  # (n, F) float16, pooled prompts
 

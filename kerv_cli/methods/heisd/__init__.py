@@ -50,7 +50,10 @@ def artifact() -> type:
 
 
 class Index(ABC):
-    """A search for stored rows with keys most similar to a given key. The rows found are then ranked exactly."""
+    """A search for the stored entries whose keys are most similar to a given key.
+
+    It returns row numbers of the datastore. The datastore then ranks these rows exactly.
+    """
 
     def __init__(self, store: Datastore, settings: Any) -> None:
         """Keep the datastore. `settings` configures the search."""
@@ -58,7 +61,7 @@ class Index(ABC):
 
     @abstractmethod
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return the row numbers of the task's k most similar entries, and perhaps of more, in ascending order.
+        """Return row numbers in ascending order: those of the task's k most similar entries, and possibly more.
 
         Args:
             key: (d,) float32, the key to compare with.
@@ -198,7 +201,7 @@ class HybridProposer(Proposer):
         return self.chosen.propose(chunk, depth)
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
-        """Let the selected proposer learn from the round; arguments as `Proposer.committed`."""
+        """Pass the results of a round to the selected proposer. `Proposer.committed` explains the arguments."""
         self.chosen.committed(chunk, first, hidden, target_tokens)
 
 

@@ -57,8 +57,9 @@ class BoundaryRanges:
         radius_high: 95th percentile of R.
         length_low: Minimum of D.
         length_high: 95th percentile of D.
-        points: R and D, both scaled to [0, 1], of about a hundred windows. They are evenly spread in the order of
-            R + D, so for α = 0.5 they give the quantiles of F. Empty in calibrations before version 1.1.
+        points: R and D of a hundred windows of the paths, both scaled to [0, 1]. All windows were sorted by R + D, and
+            evenly spaced ones were taken. Quantiles of F are computed from them. Empty in calibrations before version
+            1.1.
 
     Raises:
         CheckpointError: A range is empty or not finite.
@@ -146,5 +147,5 @@ class BoundaryRanges:
         return alpha * radius + (1 - alpha) * length
 
     def of_path(self, points: np.ndarray, alpha: float) -> float:
-        """Return F of a path through points (n, 3), in metres; `alpha` as in `fused`."""
+        """Return F of a path through points (n, 3), in metres. `alpha` is the weight of the radius."""
         return self.fused(radius_of_curvature(points), path_length(points), alpha)

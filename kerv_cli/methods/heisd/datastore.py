@@ -94,7 +94,7 @@ class Manifest:
 
 
 def prompt_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) -> Tensor:
-    """Make search keys from encoded observations.
+    """Make search keys from encoded observations: the mean tokens of some segments, normalised and concatenated.
 
     Args:
         prompt: (B, P, E) encoded prompts.

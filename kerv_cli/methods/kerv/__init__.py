@@ -24,16 +24,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class PredictorPart(ProposerPart):
-    """A predictor of the next actions: it drafts as a proposer, and `rectifier.predictor` fills in with it.
+    """A registered predictor of the next actions. It serves as a proposer, and as `rectifier.predictor`.
 
-    What it builds has a `name` and a method `predict` (`Predictor` in `prediction.py`).
+    The registered function builds a `Predictor` (`prediction.py`), or an object with its attribute `name` and its
+    method `predict`.
     """
 
     when: Literal["prefill", "states"] = PREFILL
     chains: bool = True
 
     def built(self, settings: Any, context: Any) -> Any:
-        """Build the proposer that drafts with the predictor; arguments as `Part.built`."""
+        """Build the proposer that drafts with the predictor.
+
+        Args:
+            settings: Not used. The predictor is built with its default settings.
+            context: The context in which the method is built.
+        """
         from kerv_cli.methods.kerv.prediction import PredictionProposer
 
         return PredictionProposer(self.predictor(context))
@@ -124,7 +130,7 @@ class Compensation(Rectifier):
     - `hold_strict` (ours): strict DoFs, such as the gripper, keep their last value. Otherwise they are predicted, too.
     - `predictor=draft` (ours): fill with the rejected draft's remaining tokens first. A draft was made from the
       observation, a prediction only from past actions.
-    - `rest`: in how many decodes after each compensation nothing is compensated.
+    - `rest`: number of decodes after each compensation in which nothing is compensated.
     """
 
     def __init__(self, settings: CompensateSettings, predictor: Predictor) -> None:
@@ -315,7 +321,7 @@ class Offset(Kinematic):
     """KERV, read as its README says: r = r_min + (r_max − r_min) · exp(−(|ΔK| / K_S)^φ).
 
     ΔK is the change of the variability K between the last two decodes in which drafts were compared. So r is large
-    while K is steady, and tightens when it changes. The first change of K in an episode is measured from K_S.
+    while K is steady, and small when K changes. The first change of K in an episode is measured from K_S.
     An episode begins with the radius for |ΔK| = K_S.
     """
 

@@ -102,7 +102,8 @@ class Predictor:
 
     Attributes:
         name: Name of the predictor in settings.
-        least: Minimum number of past actions that the formula needs.
+        least: Minimum number of past actions that the formula can use.
+        minimum: With fewer past actions nothing is predicted.
     """
 
     name = ""
@@ -319,9 +320,9 @@ def assemble(
 ) -> np.ndarray | None:
     """Assemble the actions of a compensated chunk: known tokens, then drafted tokens, then predictions.
 
-    `settings.steps` control steps are filled, beginning with the step in which the known tokens end. If too few DoFs of
-    that step are known, one step fewer is filled. Too few means fewer than `min_verified`, or none with `drop`. In the
-    chunk's first step any number is enough.
+    `settings.steps` control steps are filled, beginning with the step in which the known tokens end. One step fewer is
+    filled if that step has fewer than `min_verified` known DoFs, or none while `drop` is set. This does not apply if it
+    is the chunk's first step.
 
     Args:
         tokens: Known tokens of the chunk: accepted draft tokens and tokens of the target.

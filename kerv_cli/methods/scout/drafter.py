@@ -92,8 +92,8 @@ class ScoutNetwork(Compilable):
         """Encode the images and the instructions of observations.
 
         Returns:
-            The proprioception, the mean word embedding of the instruction, and two tensors for each camera view:
-            features of the cells (of the encoder's grid over the view), and image points.
+            The proprioception (B, p), the mean word embedding of the instruction (B, word width), and two tensors for
+            each camera view: features of the grid cells (B, cells, cell width), and image points (B, 2 · keypoints).
         """
         assert inputs.images is not None
         found = [inputs.proprioception, self.words(inputs.words).mean(1)]
@@ -147,7 +147,7 @@ class ScoutProposer(EarlyProposer):
         super().__init__(scout.drafter, target)
 
     def compile(self) -> Program | None:
-        """Return a program from a radius (1, 1) and views to the result of `row`. None if the scout is not compiled."""
+        """Return a program that computes `row` from a radius (1, 1) and views. None if the scout is not compiled."""
         scout = self.scout
 
         def row(radius: Tensor, *views: Tensor) -> Tensor:
@@ -159,7 +159,11 @@ class ScoutProposer(EarlyProposer):
 
     @torch.inference_mode()
     def row(self, chunk: Chunk, radius: int) -> Tensor:
-        """Draft a chunk from its observation; arguments and result as in `EarlyProposer.row`."""
+        """Draft the tokens of a chunk from its observation, for the acceptance `radius` in bins.
+
+        Returns:
+            (N + 1,): the N tokens, then the estimated probability that all of them are accepted.
+        """
         assert chunk.observation is not None
         if self.compiled is not None:
             return self.compiled(torch.tensor([[radius]]), *self.scout.views(self.inputs(chunk.observation)))[0][0]
@@ -168,9 +172,10 @@ class ScoutProposer(EarlyProposer):
 
 @dataclass(frozen=True)
 class ScoutExamples(Observations, Decodes):
-    """The n training examples of a scout: observations, and the target's tokens and estimated positions for them.
+    """The n training examples of a scout: observations, and what the target decoded and estimated from them.
 
-    The positions are those of the places, such as object and goal. The simulator's true positions are not used.
+    The target decoded tokens, and estimated the positions of object and goal. The simulator's true positions are not
+    used.
     """
 
     places: Tensor  # (n, K, 3) float32, positions estimated by the target, metres
