@@ -42,13 +42,13 @@ _CONTINUOUS = ("act", "diffusion", "groot", "pi0", "pi05", "smolvla", "tdmpc", "
 
 @dataclass(frozen=True)
 class Described:
-    """A policy as far as its costs depend on it.
+    """What the cost of a policy's decodes depends on.
 
     Attributes:
         shape: Its shape. None if it emits no action tokens.
         tokens: N, tokens of a chunk.
-        assumed: What was assumed, a phrase each.
-        encoder: Seconds of its vision encoder, if they were given.
+        assumed: Assumptions about the policy, one phrase each.
+        encoder: Seconds of its vision encoder. None: not given, so they are computed from the shape.
     """
 
     shape: Shape | None
@@ -93,7 +93,7 @@ def number_of(name: str, text: str) -> float:
         text: The text.
 
     Raises:
-        UsageError: It is no number, or below 0.
+        UsageError: The text is not a number, or the number is below 0.
     """
     match = re.fullmatch(r"(\d+(?:\.\d*)?(?:[eE]\+?\d+)?)([KMBG]?)", text.strip(), re.IGNORECASE)
     if match is None:
@@ -104,9 +104,9 @@ def number_of(name: str, text: str) -> float:
 def language_of(weights: float) -> Language:
     """Return a Llama whose layers and head have about this many weights.
 
-    The number of layers and the vocabulary are interpolated between the two published models next in size, on a
-    logarithmic scale. A layer's feed-forward part is 8/3 as wide as its hidden states, as in Llama. The width follows
-    from the number of weights.
+    The number of layers and the vocabulary are interpolated between the next smaller and the next larger published
+    model, on a logarithmic scale. A layer's feed-forward part is 8/3 as wide as its hidden states, as in Llama. The
+    width follows from the number of weights.
     """
     sizes, layers, vocabularies = np.array([*PUBLISHED.values()]).T
     at = math.log(weights)

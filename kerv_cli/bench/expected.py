@@ -31,7 +31,7 @@ class Drafts:
         depth: Largest number of tokens in a drafted chain, or of levels in a tree. 0: no drafter drafts.
         nodes: Largest number of nodes of a drafted tree. 0: the drafter drafts chains.
         source: Kind of cost of a draft that is made once per decode, such as `early`. Empty: there is none.
-        in_prefill: Whether the prefill verifies that draft.
+        in_prefill: Whether the prefill verifies the source's draft.
         retrieved: Share of the verified decodes in which `source` drafts, not the drafter.
         skipped: Share of the decodes that execute the source's draft unverified.
         encodes: Whether an unverified draft needs the target's encoder.
@@ -47,13 +47,13 @@ class Drafts:
 
 
 class Means(NamedTuple):
-    """Means of a verified decode, or of what is left of it.
+    """Mean seconds and counts of a verified decode, or of its remaining rounds.
 
     Attributes:
-        seconds: Seconds.
-        forwards: Forwards of the target's trunk.
-        accepted: Accepted draft tokens.
-        verifications: Forwards that verify a draft.
+        seconds: Mean seconds.
+        forwards: Mean number of forwards of the target's trunk.
+        accepted: Mean number of accepted draft tokens.
+        verifications: Mean number of forwards that verify a draft.
     """
 
     seconds: float = 0.0
@@ -62,11 +62,11 @@ class Means(NamedTuple):
     verifications: float = 0.0
 
     def mixed(self, other: Means, share: float) -> Means:
-        """Return the means if `other` happens with the probability `share`."""
+        """Return the weighted mean of both: `other` happens with the probability `share`, else this."""
         return Means(*((1 - share) * x + share * y for x, y in zip(self, other, strict=True)))
 
     def plus(self, other: Means) -> Means:
-        """Return the means if `other` follows."""
+        """Return the means of both in sequence: each number is the sum of this one's and the other's."""
         return Means(*map(operator.add, self, other))
 
     @property
@@ -90,7 +90,11 @@ class Decodes:
     drafts: Drafts
 
     def seconds(self, acceptance: Sequence[float]) -> float:
-        """Return the mean seconds of a decode, verified or not; for the argument see `verified`."""
+        """Return the mean seconds of all decodes, verified or not.
+
+        Args:
+            acceptance: Probability that the first, second, … token of a draft is accepted; see `verified`.
+        """
         share = self.drafts.skipped
         encoder = self._cost("encode", 1) * self.drafts.encodes
         unverified = self._source + encoder if share else 0.0
@@ -98,15 +102,19 @@ class Decodes:
         return (1 - share) * seconds + share * unverified
 
     def speed(self, acceptance: Sequence[float]) -> float:
-        """Return how many times as fast as autoregressive decodes these are; for the argument see `verified`."""
+        """Return the speed against autoregressive decoding. 2.0 means half the seconds per decode.
+
+        Args:
+            acceptance: Probability that the first, second, … token of a draft is accepted; see `verified`.
+        """
         return self.profile.decode(self.tokens) / self.seconds(acceptance)
 
     def verified(self, acceptance: Sequence[float]) -> Means:
         """Return the means of a decode that the target verifies.
 
         Args:
-            acceptance: For a draft's first, second, … token, the probability that it is accepted if those before it
-                were. The last number holds for all further tokens.
+            acceptance: Probability that the first, second, … token of a draft is accepted, if all tokens before it
+                were accepted. The last number holds for all further tokens.
         """
         size = (self.tokens - 1) * self.drafts.in_prefill
         after = [Means()] * (self.tokens + 1)
@@ -117,11 +125,18 @@ class Decodes:
         return first.plus(prefill)
 
     def acceptance_for(self, forwards: float) -> float:
-        """Return the probability of acceptance with which a verified decode takes so many forwards of the trunk."""
+        """Return the least probability of acceptance with which a verified decode takes at most `forwards` forwards.
+
+        Args:
+            forwards: Mean number of forwards of the target's trunk.
+        """
         return _least(lambda chance: self.verified([chance]).forwards <= forwards)
 
     def break_even(self) -> Means | None:
-        """Return the means of a verified decode that takes as long as AR's. None if no acceptance is enough."""
+        """Return the means at the acceptance at which a verified decode takes as long as an autoregressive one.
+
+        Returns None if it takes longer even when all draft tokens are accepted.
+        """
         limit = self.profile.decode(self.tokens)
         if self.verified([1.0]).seconds > limit:
             return None
@@ -192,7 +207,7 @@ _DRAFTERS = ("drafter", "hybrid")
 
 @dataclass(frozen=True)
 class Recorded:
-    """How a setting of a published table decoded.
+    """How a method decoded with one setting of a published table.
 
     Attributes:
         table: Name of the table.

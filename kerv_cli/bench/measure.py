@@ -1,6 +1,6 @@
 """Measure how long each phase of a decode takes. The engine runs complete decodes with dummy drafts.
 
-`measure` is the whole benchmark. What stands before it makes the decodes and cuts them into phases.
+`measure` is the whole benchmark. The functions before it run the decodes and split their seconds into phases.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _TREE = (5, 8, 50)  # depth, children, nodes of EAGLE-2's tree
 _MERGED = 30  # nodes of a merged in-prefill draft
 _TASK = "reach-v3"
 Key = tuple[str, int]
-"""Kind and rows of a phase, see `Phase`."""
+"""The attributes `kind` and `rows` of a `Phase`."""
 Lap = tuple[str, float]
 """Phase of a decode, as in `engine.record.PHASES`, and its seconds."""
 
@@ -247,7 +247,7 @@ def needs_of_draft(decoder: Any) -> tuple[float, float]:
 
 
 def source_methods() -> dict[str, str]:
-    """Return by kind of draft the method that measures it: {"early": "early_unverified", …}."""
+    """Return the method that measures each kind of draft: {"early": "early_unverified", …}."""
     return {part.cost: part.measured_by for part in ProposerPart.every().values() if part.measured_by}
 
 

@@ -54,7 +54,7 @@ class Model:
 
     @property
     def sizes(self) -> Sizes:
-        """Sizes of the target, counted in its own layers and its cache. A grown target's are those of its new trunk."""
+        """Sizes of the target, counted from its layers and its cache. An enlarged trunk counts with its new size."""
         target, drafter, cache = self.target, self.drafter, self.target.new_cache(1, 1)
         matrices = [x for x in (*target.layers.parameters(), *target.layers.buffers()) if x.dim() == 2]
         weights, head = sum(x.numel() for x in matrices), target.width * target.actions.tokens
@@ -179,7 +179,7 @@ def blank(target: Any) -> Observation:
 
 
 def memory_of(device: torch.device) -> float:
-    """Return the bytes of memory that are free on a GPU, or that this machine has."""
+    """Return the bytes of free memory of a GPU, or for a CPU the bytes of memory of this machine."""
     if device.type == "cuda":
         return float(torch.cuda.mem_get_info(device)[0])
     return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))

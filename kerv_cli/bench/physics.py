@@ -1,8 +1,8 @@
 """Compute what a decode costs on a GPU from the model's shape and the GPU's published figures. Nothing is run.
 
 A phase of a decode (prefill, verification, …) reads bytes and executes operations. Its floor is the longer of two
-times: reading at the memory's full bandwidth, and computing at the full rate. An engine is slower than that. The
-constants here say by how much, and who measured it. This module needs no torch.
+times: reading at the memory's full bandwidth, and computing at the full rate. An engine (a program that executes the
+model) is slower. The constants here say by how much, and who measured it. This module needs no torch.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Needs(NamedTuple):
         layers: Layers of the language model or drafter that run one after the other.
         blocks: Blocks of a vision encoder that run one after the other.
         kernels: Kernels outside of layers and blocks.
-        asks: Whether the target runs: its encoder or its trunk.
+        asks: Whether the phase runs the target's encoder or trunk.
     """
 
     read: float
@@ -75,14 +75,14 @@ class Needs(NamedTuple):
 class Engine:
     """How a program executes a decode.
 
-    A phase takes its floor ÷ `share`, or the time of launching its kernels if that is longer, and the system time.
+    A phase takes its floor ÷ `share`, or the time of launching its kernels if that is longer, plus the system time.
 
     Attributes:
         name: Name of the engine.
         share: Share of the device's bandwidth and rate that the program reaches.
         launch: Seconds of launching a kernel.
-        layer: Kernels of a layer of the language model or of the drafter.
-        block: Kernels of a block of a vision encoder.
+        layer: Number of kernels per layer of the language model or of the drafter.
+        block: Number of kernels per block of a vision encoder.
         system: Further seconds of each run of the target's encoder or trunk.
         source: Who measured these figures.
     """
@@ -112,7 +112,7 @@ class Engine:
         return max(times.values()) + system
 
     def bound(self, needs: Needs, device: Device) -> str:
-        """Return what takes most of the phase's time, a name of `times`."""
+        """Return what takes most of the phase's time: a key of the result of `times`."""
         times = self.times(needs, device)
         return max(times, key=times.__getitem__)
 
@@ -153,13 +153,15 @@ class Sizes:
     Attributes:
         layers: Number of weights in the matrices of all layers.
         head: Number of weights in the head.
-        drafter: Number of weights that a pass of the drafter reads, with the head's.
-        channels: Channels of all layers' attention: four operations each, per key that a token attends to.
+        drafter: Number of weights that a pass of the drafter reads, the head's included.
+        channels: Number of attention channels, summed over all layers. Each takes four operations for every key that a
+            token attends to.
         cached: Numbers in the key/value cache per token.
         weight: Bytes of a weight, on average.
         slot: Bytes of a number in the key/value cache.
-        padding: Tokens that a prefill computes beyond the prompt. Only grown targets have them.
-        drafter_padding: The same of the drafter, when it reads the prompt's states.
+        padding: Number of tokens that a prefill computes beyond the prompt. 0 except for grown targets.
+        drafter_padding: Number of tokens that the drafter computes beyond the prompt, when it reads the prompt's hidden
+            states.
     """
 
     layers: int
@@ -221,11 +223,11 @@ class Sizes:
     def needs(self, kind: str, rows: int, prompt: int) -> tuple[float, float]:
         """Return the bytes that a phase of a decode reads, and its number of arithmetic operations.
 
-        Both are 0 if the phase is no forward of the target or the drafter.
+        Both are 0 if the phase is not a forward of the target or the drafter.
 
         Args:
-            kind: Kind of phase, see `phases.Phase`.
-            rows: Number of tokens, or for a drafted tree its depth; see `phases.Phase`.
+            kind: Kind of phase, see `measure.Phase`.
+            rows: Number of tokens, or the depth of a drafted tree; see `measure.Phase`.
             prompt: P, number of prompt tokens.
         """
         if kind in ("prefill", "verify"):
@@ -257,7 +259,12 @@ class Shape:
     parts: Mapping[str, Needs]
 
     def needs(self, kind: str, rows: int) -> Needs:
-        """Return what a phase needs; the arguments are those of `Sizes.needs`."""
+        """Return what a phase needs.
+
+        Args:
+            kind: Kind of phase, see `measure.Phase`.
+            rows: Number of tokens, or the depth of a drafted tree; see `measure.Phase`.
+        """
         if kind in self.parts:
             return self.parts[kind]
         bounds = self.sizes.needs(kind, rows, self.prompt)
@@ -323,7 +330,7 @@ def encoder_of_weights(weights: float, tokens: int) -> Needs:
 
 
 def vla_shape(name: str, language: Language, prompt: int, encoder: Needs) -> Shape:
-    """Return the shape of a VLA in bfloat16, whose drafters and datastore are of the shipped ones' sizes.
+    """Return the shape of a VLA in bfloat16. Its drafters and datastore have the sizes of the shipped ones.
 
     Args:
         name: Name of the model.
@@ -354,6 +361,6 @@ def openvla(name: str, language: Language, towers: Sequence[Tower]) -> Shape:
 
 
 INSTRUCTION = 25
-"""Number of prompt tokens beside an image's."""
+"""Number of prompt tokens of an instruction."""
 SHAPES = {"openvla-7b": openvla("openvla-7b", Language(), tuple(TOWERS.values()))}
 """Shapes by name. The prompt of OpenVLA-7B is 256 patches and an instruction of 25 tokens."""

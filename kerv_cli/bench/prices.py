@@ -1,6 +1,7 @@
 """Price decodes: what an action costs on a GPU, and how fast each family of methods can be.
 
-Nothing is run and nothing is measured. This module needs no torch. `tables.py` shows what is computed here.
+Nothing is run and nothing is measured. This module needs no torch. `tables.py` shows what is computed here. AR is
+autoregressive decoding.
 """
 
 from __future__ import annotations
@@ -30,9 +31,10 @@ class Family:
     Attributes:
         name: Name in the table.
         method: The method that stands for it, see `conf/method`.
-        drafts: How it drafts at best: whatever can be retrieved or skipped is.
-        length: Tokens that a verification commits, of seven, as its paper has them. None: not published.
-        reported: The paper's own speed against AR, on its machine.
+        drafts: How the methods draft at best: they retrieve or skip in every decode in which they may.
+        length: Published mean number of tokens committed per verification, for chunks of seven tokens. None: not
+            published.
+        reported: Speed against AR that the paper reports, on its own machine. Empty: none.
     """
 
     name: str
@@ -78,16 +80,16 @@ def _computed(shape: Shape, encoder: float | None, device: Device, engine: Engin
 
 @dataclass(frozen=True)
 class Answer:
-    """What a family of methods gives with an engine. Speeds are against AR.
+    """The speed of a family of methods with an engine. Every speed is against AR: 2.0 means twice as fast.
 
     Attributes:
         family: The family.
-        ceiling: Speed if every draft token is accepted and every decode that may is executed unverified.
-        published: Speed at the acceptance that its paper reports. None: it reports none.
-        own: Speed at kerv's own acceptance. None: no table has it.
-        recorded: The setting of a published table that kerv's acceptance is from.
-        break_even: Accepted draft tokens per verification with which it is as fast as AR. None: it never is, or it
-            verifies nothing.
+        ceiling: Speed if every draft token is accepted, and every decode that may go unverified does.
+        published: Speed at the acceptance that the paper reports. None: it reports none.
+        own: Speed at the acceptance that kerv measured. None: no published table of kerv has this family.
+        recorded: The setting of a published table from which that acceptance comes.
+        break_even: Accepted draft tokens per verification at which the family is as fast as AR. None: it never is, or
+            it verifies nothing.
     """
 
     family: Family
@@ -117,7 +119,7 @@ class Estimate:
 
     @cached_property
     def parts(self) -> dict[str, tuple[float, str]]:
-        """Part of an autoregressive decode -> its seconds, and what bounds them."""
+        """Seconds of each part of an autoregressive decode, and what bounds them, by the part's name."""
         profile, bounds = self.costs.profile, self.costs.bounds
         rest = self.tokens - 1
         seconds = {
@@ -134,7 +136,7 @@ class Estimate:
 
     @cached_property
     def answers(self) -> list[Answer]:
-        """What each family of methods gives that the profile can price."""
+        """The speeds of all families of methods that the profile can price."""
         table, answers = recorded(nearest_table(self.tokens)), []
         for family in FAMILIES:
             needed = [family.drafts.source] if family.drafts.source else ["feed", "draft"]
@@ -158,7 +160,10 @@ class Estimate:
 
 
 def closest(table: Iterable[Recorded], family: Family) -> Recorded | None:
-    """Return the setting of a table that stands for a family: its method's, if possible with drafts of its form."""
+    """Return the setting of a table that represents a family. None if the table does not have its method.
+
+    Of several settings, the first with the family's form of draft (chain or tree) is taken, else the first of all.
+    """
     found = None
     for one in table:
         if one.method == family.method:

@@ -158,7 +158,7 @@ def sentence(estimates: Sequence[Estimate]) -> str:
     """Return one sentence that answers whether speculation helps.
 
     Args:
-        estimates: Of the same policy on the same device: the best engine first.
+        estimates: Estimates of one policy on one device, one per engine, the best engine first.
     """
     best, worst = estimates[0], estimates[-1]
     verified = [one for one in best.answers if not one.family.drafts.skipped]
@@ -184,10 +184,10 @@ def sentence(estimates: Sequence[Estimate]) -> str:
 
 
 def rate(estimates: Sequence[Estimate], hz: float, actions: int) -> str:
-    """Return a sentence that says who decodes fast enough for a robot.
+    """Return a sentence that says which methods decode fast enough for a robot.
 
     Args:
-        estimates: Of the same policy on the same device.
+        estimates: Estimates of one policy on one device, one per engine.
         hz: Control steps per second.
         actions: Control steps per chunk.
     """
@@ -232,7 +232,7 @@ def document(one: Estimate) -> dict[str, Any]:
 
 
 def notes(policy: Described | None, estimates: Sequence[Estimate]) -> list[str]:
-    """Return what the tables rest on, a line each."""
+    """Return the assumptions behind the tables, one line each."""
     table = nearest_table(estimates[0].tokens)
     source = "this installation has no results/tables"
     if any(one.recorded for one in estimates[0].answers):

@@ -26,13 +26,14 @@ class TracedRound:
     """A forward of the target, and the draft that it verified. The defaults are one token without a draft.
 
     Attributes:
-        start: Number of tokens committed before it. 0: it reads the prompt.
-        parents: For each node of the draft its parent's index, −1 for the first. Empty: see `nodes`.
-        nodes: Number of nodes, if the parents are unknown.
-        levels: Levels of a drafted tree. 0: a chain, or what the parents say.
+        start: Number of tokens committed before this forward. 0: it reads the prompt.
+        parents: Index of each draft node's parent. −1: the node follows the last committed token. Empty: unknown, or no
+            draft.
+        nodes: Number of draft nodes. Only needed if `parents` is empty.
+        levels: Number of levels of a drafted tree. 0: a chain, or computed from `parents`.
         accepted: Number of accepted draft tokens.
-        committed: Number of committed tokens, with the target's own.
-        proposer: Who drafted: `none`, or a proposer of kerv with the same cost.
+        committed: Number of committed tokens, the target's own token included.
+        proposer: Name of the proposer that drafted: `none`, or a proposer of kerv with the same cost.
         mode: One of MODES.
     """
 
@@ -68,7 +69,7 @@ class TracedRound:
 
     @property
     def depth(self) -> int:
-        """Levels of a drafted tree. 0 for a chain."""
+        """Number of levels of a drafted tree. 0 for a chain."""
         if self.levels or self.parents == list(range(-1, len(self.parents) - 1)):
             return self.levels
         depths: list[int] = []
@@ -82,13 +83,13 @@ class TracedDecode:
     """One decode of a trace.
 
     Attributes:
-        episode: Name of its episode.
-        tokens: N, number of tokens of its chunk.
-        rounds: Its rounds in order.
-        setting: Name of what decoded.
+        episode: Name of the episode.
+        tokens: N, number of tokens of the chunk.
+        rounds: The decode's rounds in order.
+        setting: Name of the setting that decoded, such as a method's name.
         prompt: Number of prompt tokens. None: unknown.
         encoded: Whether the target's vision encoder ran.
-        searched: Whether a datastore was searched, though no round drafts with what was found.
+        searched: Whether a datastore was searched although no round drafted with the result.
         seconds: Seconds by phase, as far as they are known: `propose`, `accept`, `rectify`, `other`.
     """
 
@@ -135,7 +136,7 @@ def read_trace(path: Path) -> list[TracedDecode]:
 
 
 def grouped(decodes: Sequence[TracedDecode]) -> Iterator[tuple[str, int, list[TracedDecode]]]:
-    """Yield the decodes of each setting and length of chunk, with both."""
+    """Yield (setting, N, decodes) for each setting and each number N of tokens per chunk."""
     groups: dict[tuple[str, int], list[TracedDecode]] = {}
     for one in decodes:
         groups.setdefault((one.setting, one.tokens), []).append(one)

@@ -28,9 +28,9 @@ def price(trace: Sequence[TracedDecode], costs: NamedProfile) -> list[dict[str, 
     """Return what the decodes of each setting of a trace cost.
 
     Returns:
-        For each setting and chunk length: the numbers of episodes and decodes, milliseconds per decode and per episode,
-        and the speed against AR decodes of as many tokens at the same costs, with the 95 % interval of resampled
-        episodes (NaN if there is one episode).
+        One dictionary for each setting and chunk length. It holds the numbers of episodes and decodes, the milliseconds
+        per decode and per episode, and the speed against AR decodes of chunks of the same length at the same costs. The
+        95 % interval of the speed comes from resampling episodes. It is NaN for a single episode.
 
     Raises:
         UsageError: The profile lacks a cost, or has costs for shorter chunks only.
@@ -85,14 +85,15 @@ def _resampled(
 
 
 def choose_length(trace: Sequence[TracedDecode], costs: NamedProfile) -> list[dict[str, Any]]:
-    """Return how fast chains of each length would have been, for each setting of a trace that drafts chains.
+    """Compute how fast drafted chains of each length would have been, for each setting that drafts chains.
 
     The probability that the i-th draft token is accepted is measured on the recorded drafts that had an i-th token and
     whose earlier tokens were all accepted. Chains inside a prefill do not count.
 
     Returns:
-        For each setting and chunk length: the fastest length of chains, the share of the resampled episodes in which it
-        is the fastest, too, and the speed against AR of each length, 0 (AR) … the longest recorded one.
+        One dictionary for each setting and chunk length. It holds the fastest length of chains, the share of resamples
+        of the episodes in which that length is the fastest, and the speed against AR of each length from 0 (AR) to the
+        longest recorded one.
 
     Raises:
         UsageError: The trace has no chain, or the profile lacks a cost.
