@@ -32,9 +32,9 @@ HOST = "127.0.0.1"
 _HOSTS = [HOST, "localhost"]
 _READS = ("GET", "HEAD")
 PATIENCE = 5.0
-"""Seconds between two checks of a connection. One that asked for nothing since the last check is closed."""
+"""Seconds between two checks of a connection. It is closed if it sent no request since the last check."""
 LAST_ANSWERS = 1.0
-"""Seconds that a board that stops gives to answers that are being computed."""
+"""Seconds for which a stopping board waits for answers that are being computed."""
 
 
 class SameOrigin:
@@ -57,7 +57,7 @@ class SameOrigin:
 
 
 class Impatient(H11Protocol):
-    """A connection that is closed if it begins a request and does not finish it."""
+    """A connection that is closed if it sends no complete request for PATIENCE seconds."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to serve a connection."""

@@ -52,7 +52,7 @@ def phase_of(closest: float | None, moved: float | None) -> str:
 
     Args:
         closest: Least distance of the fingertips to the object, metres.
-        moved: How far the object moved after they came near it, metres.
+        moved: How far the object moved after the fingertips came near it, metres.
     """
     if closest is None:
         return "unknown"
@@ -68,13 +68,13 @@ class Cell:
     """One episode of a study.
 
     Attributes:
-        label: Label of its setting.
-        task: Name of its task.
-        seed: Its seed.
-        episode: Its row number. None if it has not run.
-        kind: Its outcome, a key of OUTCOMES.
+        label: Label of the episode's setting.
+        task: Name of the episode's task.
+        seed: Seed of the episode.
+        episode: Number of the episode in the database. None if it has not run.
+        kind: Outcome of the episode, a key of OUTCOMES.
         phase: How far the robot got (see `phase_of`), a key of PHASES. The page shows it only for failures.
-        stress: Kind and level of its stress, such as `push 2`. Empty without stress.
+        stress: Kind and level of the episode's stress, such as `push 2`. Empty without stress.
     """
 
     label: str

@@ -40,7 +40,7 @@ def few(names: Iterable[str], most: int = 3) -> str:
 
 
 def page_of(run: str) -> str:
-    """Return the address of the page of a run, given its id. Artifacts have a slash in it: `target/mine`."""
+    """Return the address of the page of a run, given the run's id. An artifact's id has a slash: `target/mine`."""
     return f"/artifacts/{quote(run)}" if "/" in run else f"/studies/{quote(run)}"
 
 

@@ -23,7 +23,7 @@ class Job:
     """A recording that was asked for.
 
     Attributes:
-        future: Gives the error as text; empty if the recording is written.
+        future: Its result is the error as text, or empty once the recording is written.
         asked: Time at which the user asked for it, seconds since 1970.
     """
 
@@ -37,7 +37,7 @@ class Job:
 
     @property
     def error(self) -> str:
-        """Why the recording failed. Empty if it did not, or not yet."""
+        """Why the recording failed. Empty if it succeeded or still runs."""
         if not self.future.done():
             return ""
         lost = self.future.exception()

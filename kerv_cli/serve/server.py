@@ -38,11 +38,11 @@ LARGEST_MESSAGE = 16 * 2**20
 LONGEST = 500
 """Most characters of an error message. Texts that a client sent may be longer and are cut."""
 PATIENCE = 1.0
-"""Seconds that a new client waits for a free place: its own previous connection may just be closing."""
+"""Seconds for which a new client waits until another one leaves. Its own last connection may just be closing."""
 FAREWELL = 2.0
-"""Seconds to wait for a client that must close its connection."""
+"""Seconds for which the server waits for one client to close its connection."""
 LAST_ANSWERS = 1.0
-"""Seconds that a server that stops gives to answers that are being computed and to clients that must leave."""
+"""Seconds for which a stopping server waits for answers that are being computed, and for clients to disconnect."""
 
 
 class PolicyServer:

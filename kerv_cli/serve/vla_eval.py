@@ -25,7 +25,7 @@ from kerv_cli.serve.policy import Conversation, Log, Policy
 
 PROTOCOL_VERSION = 1
 MOST_STEPS = 20_000
-"""Most control steps of an episode. Its record grows with every step, until the client ends the episode."""
+"""Most control steps of an episode. The episode's record grows with every step until the client ends the episode."""
 _FORMATS = {("position", 3): "delta_xyz", ("rotation", 3): "axis_angle"}
 """The name that vla-eval gives to a group of DoFs, by the group's name and size."""
 
