@@ -9,7 +9,7 @@ CODE := kerv_cli tests scripts
 test test-cpus: export OMP_NUM_THREADS := 1
 
 .NOTPARALLEL:
-.PHONY: help setup test test-cpus demo torture lint format release pages docs lock clean
+.PHONY: help setup test test-cpus demo papers torture lint format release pages docs lock clean
 
 help: ## list these rules
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -33,6 +33,10 @@ demo: setup ## README's table in small: eight settings, one task, about four min
 	@echo "README's table in small: eight settings decode the same three episodes in turn, about four minutes on one core"
 	@$(BIN)/kerv build target grow=150m policy.target=mt10-vision name=mt10-150m > /dev/null
 	@$(BIN)/kerv sweep study=demo
+
+papers: setup ## train the policy of the papers' study by the commands of docs/training.md (90 minutes), then run a seed per task
+	@sed -n '/^## One action/,/^## /s/^kerv /$(subst /,\/,$(BIN))\/kerv /p' docs/training.md | sh -ex
+	@$(BIN)/kerv sweep study=papers episodes=1 study.block=1
 
 torture: setup ## kill commands, break their disk, damage their files, at random (MINUTES=1)
 	@$(BIN)/python -m pytest -s tests/reliability/torture.py

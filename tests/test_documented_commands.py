@@ -141,11 +141,17 @@ def test_a_command_in_a_message_runs(command, tmp_path, monkeypatch):
     check_runs(command)
 
 
+FEW = (
+    "kerv train drafter policy.target=mt10-h1 policy.artifacts.drafter=mt10-h1-few demos=mt10+visit "
+    "drafter.samples=1000 drafter.unroll=1 drafter.final_norm=false train.steps=300 train.validate_every=100 "
+    "train.stored=float16"
+)
 REMEDIES = {
     "rollout method=ar,one_pass": "kerv rollout -m method=ar,one_pass",
     "rollout policy.target=mine": "kerv train target name=mine",
     "rollout policy.target=mt10-150m": "kerv build target grow=150m policy.target=mt10-vision name=mt10-150m",
     "sweep study=papers_libero": "kerv build target grow=150m policy.target=libero-state name=libero-150m",
+    "rollout method=spec_vla policy.artifacts.drafter=mt10-h1-few": FEW,
     "rollout nonsense=3": "kerv rollout --cfg",
     "report study=nosuch": "kerv runs list",
     "report study=papers": "kerv sweep study=papers",

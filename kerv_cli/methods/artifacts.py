@@ -23,7 +23,7 @@ from kerv_cli.engine.protocol import Target
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets import checkpoint
 from kerv_cli.targets.checkpoint import TargetDescription
-from kerv_cli.targets.folders import beside, check_not_shipped, find_target
+from kerv_cli.targets.folders import beside, check_not_shipped, command_of_a_study, find_target
 
 TARGET = "target"
 
@@ -314,8 +314,9 @@ class Artifacts:
                 continue
             files, path = kind_of(kind), self.path(kind)
             if files.command and not self.exists(kind):
-                line = " ".join(self._making(files))
-                raise CheckpointError(f"no {files.noun} in {path}: run 'kerv {line}', or name a folder that holds one")
+                raise CheckpointError(
+                    f"no {files.noun} in {path}: run '{self._making(files)}', or name a folder that holds one"
+                )
             description = files.checked(path, self.description)
             hashes[kind] = files.digest(path, description)
             todo += files.needs(description)
@@ -327,12 +328,13 @@ class Artifacts:
             check_sources(hashes_of_sources, hashes, what, again)
         return hashes
 
-    def _making(self, files: Artifact[Any]) -> tuple[str, ...]:
-        """Return the command-line arguments after `kerv` that make a missing artifact."""
+    def _making(self, files: Artifact[Any]) -> str:
+        """Return the command that makes a missing artifact."""
         target, name = f"policy.target={self.policy.target}", self.policy.artifacts.get(files.kind)
         if name is None or "/" in name:
-            return "prepare", target
-        return *files.command, target, f"policy.artifacts.{files.kind}={name}"
+            return f"kerv prepare {target}"
+        word = f"policy.artifacts.{files.kind}={name}"
+        return command_of_a_study(word) or " ".join(("kerv", *files.command, target, word))
 
     def load(self, kind: str) -> Any:
         """Load the policy's artifact of this kind. Further calls in this process return the same object.

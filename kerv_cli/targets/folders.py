@@ -54,19 +54,24 @@ def find_target(results: str, name: str) -> Path:
             f"target '{name}' is unfinished: 'kerv runs show target/{name}' shows the command that goes on with its "
             "training"
         )
-    remedies = ["name a folder that holds target.json" if "/" in name else f"make it with '{_made_by(name)}'"]
+    making = command_of_a_study(f"name={name}") or f"kerv train target name={name}"
+    remedies = ["name a folder that holds target.json" if "/" in name else f"make it with '{making}'"]
     names = target_names(results)
     remedies += [f"take one of {', '.join(names)}"] if names else []
     raise UsageError(f"no target '{name}' in {', '.join(map(str, folders))}: {', or '.join(remedies)}")
 
 
-def _made_by(name: str) -> str:
-    """Return the command that makes a target: the one that a study names that runs on it, else `kerv train target`."""
+def command_of_a_study(word: str) -> str | None:
+    """Return the command that a study's file gives for making what the study needs, if one contains the setting `word`.
+
+    Args:
+        word: A setting with its value, such as `name=mt10-h1-150m` or `policy.artifacts.drafter=mt10-h1-few`.
+    """
     for path in sorted((conf_dir() / "study").glob("*.yaml")):
         for command in read_yaml_lines(path, f"study={path.stem}")[0].get("first", []):
-            if f"name={name}" in command.split():
+            if word in command.split():
                 return str(command)
-    return f"kerv train target name={name}"
+    return None
 
 
 def check_not_shipped(path: Path, word: str) -> None:
