@@ -77,7 +77,7 @@ class Means(NamedTuple):
 
 @dataclass(frozen=True)
 class Decodes:
-    """The decodes of a method at a profile's costs.
+    """Computes the mean cost of a method's decodes from a latency profile.
 
     Attributes:
         profile: Seconds of every kind of forward and draft.

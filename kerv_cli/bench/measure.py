@@ -214,10 +214,10 @@ def phases_of(
 
 
 def profile_of(phases: Sequence[Phase], tokens: int) -> Profile:
-    """Return a latency profile: the median seconds of each kind of phase, by its number of rows.
+    """Return a latency profile: the median seconds of each kind of phase, by the phase's number of rows.
 
     Args:
-        phases: Measured phases. Those of a kind are sorted by their rows.
+        phases: Measured phases. Phases of one kind must be in increasing order of rows (`Phase.rows`).
         tokens: N, tokens of a chunk.
     """
     costs: dict[str, tuple[tuple[int, ...], tuple[float, ...]]] = {}

@@ -185,7 +185,7 @@ class Sizes:
         slot: float,
         shared: float = 1.0,
     ) -> Sizes:
-        """Return the sizes of a Llama-style target, and of its drafter of one such layer.
+        """Return the sizes of a Llama-style target and of its drafter, which has one layer of the same shape.
 
         Args:
             width: Width of the hidden states.

@@ -80,7 +80,7 @@ def anchor_rows() -> list[Row]:
 
 
 def part_rows(estimates: Sequence[Estimate]) -> list[Row]:
-    """Return a row per part of an autoregressive decode. Each cell has the engines side by side."""
+    """Return one row per part of an autoregressive decode. Each cell lists the figures of all engines."""
     rows = []
     for name in estimates[0].parts:
         taken, shares, bounds = [], [], []
@@ -96,7 +96,7 @@ def part_rows(estimates: Sequence[Estimate]) -> list[Row]:
 
 
 def family_rows(estimates: Sequence[Estimate]) -> list[Row]:
-    """Return a row per family of methods. Each cell has the engines side by side."""
+    """Return one row per family of methods. Each cell lists the figures of all engines."""
     rows = []
     for answers in zip(*(one.answers for one in estimates), strict=True):
         family = answers[0].family

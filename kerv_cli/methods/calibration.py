@@ -206,7 +206,7 @@ class Calibration:
 
 
 class CalibrationArtifact(Artifact[Calibration]):
-    """The kind of artifact `calibration`. It is a single file, so its path is that of the file, not of a folder."""
+    """The kind of artifact `calibration`. It is a single file. The paths of this class are paths of the file."""
 
     kind = noun = "calibration"
     made, command = "made", ("calibrate",)

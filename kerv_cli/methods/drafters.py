@@ -209,12 +209,12 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         """Write the weights and the description.
 
         Args:
-            path: The folder.
+            path: Folder to write to.
             module: The network.
-            made_for: The target that it drafts for.
-            provenance: How it was made.
+            made_for: The target that the network drafts for.
+            provenance: How the drafter was made.
             stored: Number format of the weights on disk: `float32`, `float16` or `int8`.
-            fields: Further fields of this kind's description.
+            fields: Further fields of the description, if this kind of drafter has any.
 
         Returns:
             The hash of the weights.

@@ -119,12 +119,14 @@ class PublicDrafter(nn.Module):
         return run_layers(self.layers, self.shape.language, x, positions, cache, seen, mask)
 
     def prompt_mask(self, x: Tensor, cache: DraftCache | None, seen: np.ndarray | Tensor | None) -> Tensor:
-        """Return the additive attention mask for `mask=prompt`, which hides all keys but the prompt's first P − 1.
+        """Return the additive attention mask for `mask=prompt`.
+
+        A query sees a key only if the key is one of the prompt's first P − 1 tokens and `seen` allows it.
 
         Args:
             x: (B, T, E) inputs of the layers.
             cache: Keys and values of S earlier tokens. None: there are none, and x is the prompt.
-            seen: (T, M) bool, which of the last M keys each query may see. Others are also hidden. None: causal.
+            seen: (T, M) bool, which of the last M keys each query may see. None: causal.
 
         Returns:
             (T, S + T): 0 for visible keys, −∞ for hidden keys.

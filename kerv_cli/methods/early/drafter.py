@@ -129,10 +129,10 @@ class EarlyNetwork(Compilable):
 def choose(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tensor, Tensor]:
     """Choose the tokens that are most likely to be accepted, and estimate the probability that all are accepted.
 
-    A token is accepted if the target's token is within ±radius. So the best bin is the one with the most probability
-    within ±radius, which need not be the most probable bin. If several bins are about equally good, the one with more
-    probability close to it wins, because it is likely nearer to the target's token. For a strict token the most
-    probable bin is chosen.
+    A token is accepted if the target's token is at most `radius` bins away. So the best bin is the one with the most
+    probability in this range around it. It need not be the most probable bin. If several bins are about equally good,
+    the bin with more probability close to it wins, because it is likely nearer to the target's token. For a strict
+    token the most probable bin is chosen.
 
     The estimate treats tokens as independent, and training on soft labels makes it too low. Use it only to compare
     chunks.
@@ -260,7 +260,7 @@ class EarlyDrafter(TrainableDrafter):
         return (network(batch.features.to(target.device).float()),)
 
     def token_loss(self, logits: Tensor, target: Any, batch: Decodes, settings: Any) -> Tensor:
-        """Return the cross-entropy of logits with soft labels: the target's tokens and, less, their neighbouring bins.
+        """Return the cross-entropy of logits with soft labels, which spread each target token over neighbouring bins.
 
         Args:
             logits: (B, N, V).

@@ -454,7 +454,10 @@ class VerifySkip(Skip):
 
     @classmethod
     def build(cls, settings: SimilaritySkipSettings, context: Context) -> VerifySkip:
-        """Build skip=similarity. If the method's proposer also retrieves, the search runs only once for both."""
+        """Build the part that the setting `skip=similarity` chooses.
+
+        If the method's proposer also retrieves, the datastore is searched only once for both.
+        """
         proposer: Proposer | None = context.built["proposer"]
         retrieval = proposer.proposers["retrieval"] if isinstance(proposer, HybridProposer) else proposer
         if not isinstance(retrieval, RetrievalProposer):

@@ -240,7 +240,7 @@ class Walk(Predictor):
     noise_ratio = 1.0 / 1e-3  # Q / R
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return the weights (horizon, window): the filtered last action, for every step ahead."""
+        """Return the weights (horizon, window). All rows are equal: every prediction is the filtered last action."""
         state, variance = np.eye(1, window)[0], 1.0  # all variances divided by R
         for newest in np.eye(window)[1:]:
             variance += self.noise_ratio

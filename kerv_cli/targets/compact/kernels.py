@@ -263,8 +263,8 @@ def attention(frames, out, qkv, tables, cache, start, filled, mask, keys, values
         keys: (B · A, panels, C, PANEL) copy of the cached keys. It is stored like the weights of a linear layer with
             the channels as inputs and the slots as outputs, in panels of PANEL outputs. So one matrix product gives the
             scores of a query.
-        values: (B · A, panels, slots, PANEL) copy of the cached values, stored likewise with the slots as inputs and
-            the channels as outputs. So one matrix product applies the attention weights.
+        values: (B · A, panels, slots, PANEL) copy of the cached values. It is stored like the weights of a linear layer
+            with the slots as inputs and the channels as outputs. So one matrix product applies the attention weights.
     """
     tokens, heads, channels = tables.shape[0], cache.shape[2], tables.shape[2]
     stop, size, parts = start + tokens, 4 * frames.shape[1], values.shape[1]

@@ -245,8 +245,8 @@ class Program:
             nodes: Maximum number of nodes of the tree.
             inputs: Inputs of the program for the tree's root.
             position: Rotary position of the tree's first level.
-            cache: Keys and values of earlier tokens. Those of drafted tokens are written after them, but `cache.length`
-                stays as it is.
+            cache: Keys and values of earlier tokens. The program writes the keys and values of drafted tokens after
+                them, but leaves `cache.length` as it is.
 
         Returns:
             Tokens (n,), parents (n,) with −1 for the root, and the mask (n, n) bool: entry [i, j] says whether node j

@@ -53,7 +53,7 @@ class Recorded:
     Attributes:
         tape: The tape that records its operations.
         place: Integer tensor: for each element, its index in the float32 memory (frame) of one batch row.
-        shape: The shape of the tensor, which `place` has, too.
+        shape: The shape of the tensor and of `place`.
     """
 
     requires_grad = is_cuda = False

@@ -51,7 +51,7 @@ class Inputs:
     """A batch of B observations as tensors.
 
     Attributes:
-        images: (B, 3, size, size · views) uint8. None for a policy that reads the state.
+        images: (B, 3, size, size · views) uint8, all camera views side by side. None for a policy that reads the state.
         proprioception: (B, p) float32, the robot's own measurements.
         states: (B, s) float32, the simulator's state. A policy that reads images ignores it.
         words: (B, L) int64, ids of the instruction's words.
@@ -266,8 +266,8 @@ class CompactTarget(Compilable):
         Args:
             words: (B, L) ids of words.
             proprioception: (B, p).
-            seen: For a vision policy the outputs of its vision encoders: vision tokens (B, grid² · views, E) and image
-                points (B, 2 · keypoints · views). Otherwise the states (B, s).
+            seen: For a vision policy two tensors from its vision encoders: vision tokens (B, grid² · views, E) and
+                image points (B, 2 · keypoints · views). For any other policy the states (B, s).
         """
         embedded, hand = self.word_embedding(words), hand_features(proprioception, self.centre)
         if self.cameras:
@@ -381,8 +381,8 @@ class CompactTarget(Compilable):
         Args:
             tokens: The new tokens (T,) int64.
             positions: (T,) rotary positions of the new tokens.
-            cache: Keys and values of earlier tokens. Those of the new tokens are appended.
-            seen: Which tokens each new token attends to, as in `attention_mask`. None: attention is causal.
+            cache: Keys and values of earlier tokens. This forward appends the new ones.
+            seen: (T, M) bool, which of the last M tokens each new token attends to. None: attention is causal.
 
         Returns:
             The most probable token after each new token, (T,) int64, and their hidden states (1, T, E).

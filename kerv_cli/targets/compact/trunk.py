@@ -96,8 +96,8 @@ class LayerStack(Compilable):
         outer: E, width of inputs and outputs.
         heads: Number of attention heads.
         depth: Number of layers.
-        padding: Number of tokens that are appended to a prompt, hidden by the mask, and dropped after the prefill. They
-            make the prefill cost as much as that of a longer prompt (`targets/grown.py`).
+        padding: Number of tokens that are appended to a prompt, hidden by the mask, and dropped after the prefill. The
+            prefill then costs as much as for a longer prompt (`targets/grown.py`).
     """
 
     inputs = 1
@@ -156,9 +156,8 @@ class LayerStack(Compilable):
         Args:
             inputs: Tensors (B, T, E), as `enter` takes them.
             positions: (T,) rotary positions of the new tokens.
-            cache: Keys and values of earlier tokens. Those of the new tokens are appended. None: there are no earlier
-                tokens.
-            seen: Which tokens each new token attends to, as in `attention_mask`. None: attention is causal.
+            cache: Keys and values of earlier tokens. This forward appends the new ones. None: no earlier tokens.
+            seen: (T, M) bool, which of the last M tokens each new token attends to. None: attention is causal.
         """
         tokens, padding = inputs[0].shape[1], 0 if cache is not None and cache.length else self.padding
         if padding:
@@ -227,8 +226,7 @@ class Trunk(LayerStack):
         Args:
             x: (B, T, E) embeddings of the new tokens.
             positions: (T,) rotary positions of the new tokens.
-            cache: Keys and values of earlier tokens. Those of the new tokens are appended. None: there are no earlier
-                tokens.
-            seen: Which tokens each new token attends to, as in `attention_mask`. None: attention is causal.
+            cache: Keys and values of earlier tokens. This forward appends the new ones. None: no earlier tokens.
+            seen: (T, M) bool, which of the last M tokens each new token attends to. None: attention is causal.
         """
         return self.run((x,), positions, cache, seen)

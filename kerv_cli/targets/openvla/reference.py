@@ -27,7 +27,7 @@ def check_installed() -> None:
     """Check that transformers is installed.
 
     Raises:
-        UsageError: It is not.
+        UsageError: transformers is not installed.
     """
     try:
         import transformers  # noqa: F401
@@ -171,10 +171,12 @@ def _block(state: Mapping[str, Tensor], block: str, names: Mapping[str, str]) ->
 
 
 def parity(target: Any) -> dict[str, float]:
-    """Decode sample observations, and compare every token and its logits with transformers' after the same tokens.
+    """Decode sample observations, and compare each token and its logits with what transformers computes.
+
+    Both compute the logits of a token after the same prompt and the same earlier tokens.
 
     Args:
-        target: An `OpenVLATarget`. The reference has its device and number format, but is first made in float32.
+        target: An `OpenVLATarget`. The `Reference` is loaded in float32, then moved to its device and number format.
 
     Returns:
         Numbers by name, in this order:

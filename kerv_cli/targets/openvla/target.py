@@ -156,9 +156,8 @@ class OpenVLATarget:
         Args:
             x: (B, T, E) embeddings of the new tokens.
             positions: (T,) rotary positions of the new tokens.
-            cache: Keys and values of earlier tokens. Those of the new tokens are appended. None: there are no earlier
-                tokens.
-            seen: Which tokens each new token attends to, as in `attention_mask`. None: attention is causal.
+            cache: Keys and values of earlier tokens. This forward appends the new ones. None: no earlier tokens.
+            seen: (T, M) bool, which of the last M tokens each new token attends to. None: attention is causal.
         """
         return self.model.language_model.model(x, positions, cache, seen)
 

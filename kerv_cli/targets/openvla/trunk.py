@@ -121,9 +121,8 @@ def run_layers(
         language: Shape of the language model.
         x: (B, T, E) embeddings of the new tokens.
         positions: (T,) rotary positions of the new tokens.
-        cache: Keys and values of earlier tokens. Those of the new tokens are appended. None: there are no earlier
-            tokens.
-        seen: Which tokens each new token attends to, as in `attention_mask`. None: attention is causal.
+        cache: Keys and values of earlier tokens. This forward appends the new ones. None: no earlier tokens.
+        seen: (T, M) bool, which of the last M tokens each new token attends to. None: attention is causal.
         mask: Additive mask to use instead of `seen`. None: the mask is made from `seen`.
     """
     rotary = rotation(positions, language.channels, language.rope_theta, x.dtype)
