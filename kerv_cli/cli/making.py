@@ -24,7 +24,8 @@ def as_planned(database: Database, plan: bool = False, as_json: bool = False) ->
         as_json: Print the plan as JSON.
 
     Yields:
-        What the work calls once its settings are checked.
+        Function that the work calls once its settings are checked. It starts the entry in the database, or prints the
+        plan.
     """
     from kerv_cli.lab import runs
     from kerv_cli.lab.command import current_command

@@ -38,7 +38,7 @@ class Choice:
             were not timed.
         episode_speedup: Speed per episode of the chosen setting, or else of the candidate, against the baseline. NaN if
             it was not timed.
-        runs: Number of runs that its interval covers.
+        runs: Number of runs that the interval of `episode_speedup` covers.
     """
 
     where: str

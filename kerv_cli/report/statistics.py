@@ -194,8 +194,8 @@ def pairs_to_settle(counts: PairedCounts, margin: float) -> float:
 def mcnemar(counts: PairedCounts) -> float:
     """Return the two-sided p-value of McNemar's exact test (McNemar, Psychometrika 12, 1947).
 
-    The test uses only the pairs in which exactly one side succeeded. Null hypothesis: each of them is equally likely to
-    favour the baseline or the method. Then their number is binomial with probability 1/2.
+    The test uses only the pairs in which exactly one side succeeded. Under the null hypothesis, each of these pairs is
+    won by the method with probability 1/2. The number of pairs that the method wins is then binomial.
 
     Args:
         counts: Outcomes of the pairs.

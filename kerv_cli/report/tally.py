@@ -53,7 +53,7 @@ class Tally:
 
     @classmethod
     def of_records(cls, decodes: Iterable[DecodeRecord], dofs: int) -> Tally:
-        """Count the verifications of some decodes, of actions with `dofs` DoFs."""
+        """Count the verifications of some decodes. `dofs` is the number of DoFs of an action."""
         rounds = itertools.chain.from_iterable(decode.rounds for decode in decodes)
         verified = filter(attrgetter("is_verification"), rounds)
         numbers = [(one.start, len(one.drafted), one.accepted, one.tree_size) for one in verified]
@@ -66,7 +66,7 @@ class Tally:
 
     @property
     def drafts(self) -> int:
-        """Number of verifications."""
+        """Number of verified drafts. Each verification has one draft."""
         return int(self.lengths.sum())
 
     @property

@@ -201,9 +201,10 @@ def presample(
 
 
 def reference_level(records: Sequence[DecodeRecord], actions: ActionSpace, chunk: int) -> Variability:
-    """Return a task's reference level K_S, the median over decodes of the variability K, by each measure of K.
+    """Return a task's reference level K_S: the median of the variability K over the decodes, for each measure of K.
 
-    Decoding divides by K_S. So it is at least the smallest K above 0: one token of a chunk is off by one bin.
+    Decoding divides by K_S, so it must not be 0. If the median is lower, K_S is the smallest possible K above 0, which
+    is that of a chunk with a single token off by one bin.
 
     Args:
         records: Decodes of the task.
