@@ -248,8 +248,8 @@ class Shape:
         sizes: Sizes of trunk, head and EAGLE's drafter.
         layers: Number of the trunk's layers.
         prompt: P, number of prompt tokens.
-        parts: Needs of what runs at most once per decode, by kind of cost: `encode` (vision towers and projector),
-            `early`, `scout`, `retrieval`.
+        parts: Bytes and operations of each phase that runs at most once per decode, by kind of cost: `encode` (vision
+            towers and projector), `early`, `scout`, `retrieval`.
     """
 
     name: str
@@ -275,7 +275,7 @@ class Shape:
 
 
 def priced(shape: Shape, device: Device, engine: Engine) -> Profile:
-    """Return the cost of each phase of a decode of up to `CHUNK` tokens, as a profile that prices studies."""
+    """Return a latency profile with the computed seconds of each phase, for chunks of up to `CHUNK` tokens."""
     from kerv_cli.engine.cost import Profile
 
     rows = {
@@ -302,7 +302,7 @@ def encoder_of(towers: Sequence[Tower], width: int) -> Needs:
     """Return what OpenVLA's encoder needs: all blocks but the last of each tower, and the projector of three layers.
 
     Args:
-        towers: Its vision transformers.
+        towers: Shapes of the encoder's vision transformers.
         width: Width of the language model.
     """
     weights, flops, blocks = 0.0, 0.0, 0

@@ -38,7 +38,7 @@ class SkipDecision(NamedTuple):
     Attributes:
         tokens: The N tokens of the chunk, which are executed without verification. None: the target decodes.
         proposer: Name of the proposer that drafted them. PARALLEL (`record.py`): a parallel target computed them.
-        reason: Why, as in `DecodeRecord`. None: the rule states no reason.
+        reason: The rule's reason to skip or to verify, which `DecodeRecord.reason` stores. None: no reason is given.
     """
 
     tokens: Sequence[int] | None = None

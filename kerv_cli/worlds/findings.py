@@ -34,7 +34,7 @@ def find(what: str, check: Callable[[], str]) -> Finding:
 
     Args:
         what: What is checked.
-        check: Does the check and returns a text about what it saw.
+        check: Function that runs the check. It returns a text that describes the result.
     """
     try:
         return Finding(what, True, check())

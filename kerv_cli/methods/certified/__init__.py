@@ -82,7 +82,7 @@ def needs_outside(settings: ScopedSettings) -> tuple[str, ...]:
 
 @ProposerPart("scoped", ScopedSettings, needs=needs_outside, when=PREFILL, chains=True)
 def scoped(settings: ScopedSettings, context: Context) -> Proposer:
-    """Build the certified proposer on the certificate's tasks, and the proposer `outside` on other tasks."""
+    """Build the proposer for the decoder's task: the certified one if the certificate covers it, else `outside`."""
     certificate = covering(context)
     if certificate is not None and certificate.certified is not None:
         source = certificate.certified.source

@@ -149,7 +149,7 @@ def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
 def best(vectors: np.ndarray, rows: np.ndarray, key: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the k rows most similar to a key, and their similarities.
 
-    Dot products are computed in float64, because the last bit of a float32 result depends on a row's place in the
+    Dot products are computed in float64, because the last bit of a float32 result depends on the row's index in the
     matrix.
 
     Args:

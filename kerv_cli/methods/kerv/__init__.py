@@ -192,12 +192,15 @@ class RadiusRange:
 
 @dataclass
 class KinematicThresholdSettings(RadiusRange):
-    """KERV: the acceptance radius r follows the variability K, the distance of the last drafts to the target.
+    """KERV: the acceptance radius r follows the variability K, the distance of the last drafts to the target's tokens.
 
-    Its authors' summaries leave open how Δr = (r_max − r_min) · exp(−(ΔK / K_S)^φ) changes r (docs/methods.md §3.2).
-    Readings: `offset`: r = r_min + Δr, so r shrinks when K changes, as KERV's README says. `quoted`: r ← r + Δr, the
-    literal formula, which never shrinks. `change`: r shrinks when K has risen. `kinematic` (ours): r is large where K
-    is small.
+    KERV's authors leave open how Δr = (r_max − r_min) · exp(−(ΔK / K_S)^φ) changes r (docs/methods.md §3.2). Each
+    reading is one kind of threshold:
+
+    - `offset`: r = r_min + Δr, as KERV's README says. r shrinks when K changes.
+    - `quoted`: r ← r + Δr, as the formula is printed. r never shrinks.
+    - `change`: r shrinks when K has risen.
+    - `kinematic` (ours): r is large while K is small.
     """
 
     kind: str = "kinematic"

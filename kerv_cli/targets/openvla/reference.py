@@ -145,7 +145,16 @@ class Reference:
 
     @torch.inference_mode()
     def logits(self, pixels: Tensor, ids: list[int], following: list[int]) -> Tensor:
-        """Return the logits (n + 1, ids) after the prompt and after each of n following ids, in one forward."""
+        """Return the logits after the prompt and after each of n following ids, in one forward.
+
+        Args:
+            pixels: (1, 6, s, s) image.
+            ids: Ids of the prompt's text.
+            following: The n ids after the prompt.
+
+        Returns:
+            (n + 1, vocabulary).
+        """
         prompt = self.prompt(pixels, ids)
         after = self.llama.model.embed_tokens(torch.tensor([following], dtype=torch.long, device=self.device))
         found: Tensor = self.llama(inputs_embeds=torch.cat([prompt, after], 1)).logits[0, prompt.shape[1] - 1 :]
