@@ -90,8 +90,8 @@ class Target(Protocol):
             positions: Position of each new token in the sequence (T,), for the positional encoding.
             cache: From `new_cache`. The new tokens attend to all cached tokens and are added to them. None: no earlier
                 tokens.
-            seen: Attention mask (T, T) bool: whether new token i attends to new token j. None for a causal mask. It is
-                an array, or possibly a tensor if the target is on a GPU.
+            seen: Attention mask (T, T) bool: whether new token i attends to new token j. None for a causal mask. A
+                target on a GPU may get a tensor instead of an array.
         """
 
     def head(self, hidden: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class CertifiedSkipSettings:
-    """On the certificate's tasks, use its skip rule. On other tasks, use a streak.
+    """On the certificate's tasks, use the certified skip rule. On other tasks, use a streak.
 
     A streak executes drafts without verification, as long as verified drafts agree with the target
     (docs/methods.md §4.5).

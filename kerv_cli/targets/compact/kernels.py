@@ -314,7 +314,8 @@ def sum_of_exponentials(x, most):
 def choose(frame, columns, numbers):
     """Choose the tokens of a chunk, and estimate the probability that all are accepted, see `early.drafter.choose`.
 
-    The arguments are those of `elementwise`. The constants are 1 for tokens that must equal the target's, else 0.
+    `elementwise` explains the arguments. The operation's constants in `numbers` are one per token: 1 if the token must
+    equal the target's, else 0.
     """
     out, a, rows, width, stride, first = columns[1], columns[2], columns[4], columns[5], columns[6], columns[7]
     radius, odds = int(frame[columns[3]]), _ONE

@@ -102,7 +102,7 @@ class CompactTarget(Compilable):
         enlarges: Function that enlarges a drafter, if the target was enlarged together with one (docs/methods.md §0.2).
             None for any other target.
         hand_and_object: Positions (3,) in metres of the hand and the object in the last observation that `encode` read.
-            A vision policy estimates the object's. None: nothing was read.
+            A vision policy estimates the object's position. None: nothing was read.
     """
 
     centre: Tensor
