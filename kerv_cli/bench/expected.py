@@ -133,9 +133,9 @@ class Decodes:
         return _least(lambda chance: self.verified([chance]).forwards <= forwards)
 
     def break_even(self) -> Means | None:
-        """Return the means at the acceptance at which a verified decode takes as long as an autoregressive one.
+        """Return the means of a verified decode that takes as long as an autoregressive decode.
 
-        Returns None if it takes longer even when all draft tokens are accepted.
+        This needs a certain probability of acceptance. Returns None if even the probability 1 is not enough.
         """
         limit = self.profile.decode(self.tokens)
         if self.verified([1.0]).seconds > limit:

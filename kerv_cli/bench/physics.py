@@ -106,7 +106,7 @@ class Engine:
         }
 
     def seconds(self, needs: Needs, device: Device) -> float:
-        """Return the seconds of a phase on a device."""
+        """Return the seconds that a phase with these needs takes on a device."""
         times = self.times(needs, device)
         system = times.pop(SYSTEM)
         return max(times.values()) + system

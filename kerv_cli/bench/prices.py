@@ -199,7 +199,7 @@ class Anchor:
 
     @property
     def ours(self) -> float:
-        """The computed time, milliseconds."""
+        """Time of one action as kerv computes it, milliseconds."""
         shape = SHAPES["openvla-7b"]
         shape = replace(shape, sizes=replace(shape.sizes, weight=self.weight))
         return 1e3 * priced(shape, DEVICES[self.device], self.engine).decode(ACTION)

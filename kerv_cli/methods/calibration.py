@@ -58,7 +58,8 @@ class BoundarySection:
 
     Attributes:
         episodes: Number of episodes that were measured.
-        windows: The ranges, by the number of positions in the boundary's window, as text such as `15`.
+        windows: The ranges for each window of the boundary. The key is the window's number of positions as text, such
+            as `15`.
     """
 
     episodes: int

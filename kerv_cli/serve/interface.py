@@ -111,7 +111,7 @@ class Interface:
         return numbers[:few], np.concatenate([numbers, np.zeros(many - len(numbers))])
 
     def converted(self, actions: np.ndarray) -> np.ndarray:
-        """Convert the gripper's values in actions to the client's convention, the setting `gripper`.
+        """Convert the gripper's values in actions to the client's convention, which the setting `gripper` chooses.
 
         Args:
             actions: (H, D), H actions of D DoFs in environment units.

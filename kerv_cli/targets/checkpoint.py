@@ -271,7 +271,7 @@ def target_fields(
 
 
 def read_description(folder: Path, kind: str, schema: type[T]) -> T:
-    """Return the description of an artifact. Check its fields, and that the weights have the hash stored in it.
+    """Return the description of an artifact. Check its fields, and that the weights have the hash that it names.
 
     Args:
         folder: Folder of the artifact.

@@ -68,7 +68,7 @@ class Trial:
             check: The check.
 
         Returns:
-            The largest difference of two logits, relative to their spread, as text.
+            Text with the largest difference of two logits, in standard deviations of the logits.
         """
         worst = 0.0
         for hidden, expected in check(self):

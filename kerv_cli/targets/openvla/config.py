@@ -209,7 +209,7 @@ def action_space(shape: Shape, bounds: Bounds, like: ActionSpace | None, control
 
     Args:
         shape: Shape of the checkpoint.
-        bounds: Action statistics, which become `low` and `high` of the space. A DoF that their mask excludes gets -1
+        bounds: Action statistics, which become `low` and `high` of the space. A DoF that `bounds.mask` excludes gets -1
             and 1.
         like: Action space of an environment, from which names, groups, strict DoFs and control rate are copied. None:
             OpenVLA's seven DoFs.
