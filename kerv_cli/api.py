@@ -23,7 +23,8 @@ from kerv_cli.catalogue.entries import RunEntry, find_run, find_runs, matching, 
 from kerv_cli.episodes.resolve import resolve, resolve_rollout, study_name
 from kerv_cli.lab.command import chosen_store
 from kerv_cli.lab.database import opened
-from kerv_cli.lab.store import ROLLOUT, StudyStore
+from kerv_cli.lab.store import ROLLOUT
+from kerv_cli.lab.store import Study as StoredStudy
 from kerv_cli.lab.study import plan, run
 from kerv_cli.report.report import report as write_reports
 from kerv_cli.report.results import Row, averaged, frame_of
@@ -45,7 +46,7 @@ class Study:
         store: The study in the database.
     """
 
-    store: StudyStore
+    store: StoredStudy
 
     @property
     def name(self) -> str:
@@ -114,7 +115,7 @@ def rollout(*overrides: str, grid: bool = False, **settings: object) -> Study:
         command = ["rollout", *(["-m"] if grid else []), *typed]
         planned = plan(resolved, opened(resolved.first.results), command, ROLLOUT)
         run(planned, save=save_recording)
-    return Study(planned.store)
+    return Study(planned)
 
 
 def sweep(study: str | Path, *overrides: str, **settings: object) -> Study:
@@ -139,9 +140,9 @@ def sweep(study: str | Path, *overrides: str, **settings: object) -> Study:
         failed = run(planned, save=save_recording).failed
     if failed:
         one, lost = failed[0].episodes[0], sum(len(failure.episodes) for failure in failed)
-        of_all = f"{lost} of {len(planned.study.episodes)} episodes failed"
+        of_all = f"{lost} of {len(planned.episodes)} episodes failed"
         raise KervError(f"{of_all}, {one.setting.label} on {one.task}: {failed[0].reason}")
-    return Study(planned.store)
+    return Study(planned)
 
 
 def load_study(name: str, results: str | Path = "results", store: str = "") -> Study:

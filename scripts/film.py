@@ -19,7 +19,7 @@ from PIL import Image, ImageDraw, ImageFont
 from kerv_cli.board.recorder import record_episode
 from kerv_cli.catalogue.episodes import find_episode, outcomes
 from kerv_cli.lab.database import opened
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.store import Study
 from kerv_cli.report.viewing.film import film_of
 from kerv_cli.report.viewing.token_outcomes import OUTCOMES, TokenOutcome, chunk_size, outcomes_of
 
@@ -53,7 +53,7 @@ class Panel:
     frames: list[Image.Image]
 
 
-def read_panel(store: StudyStore, label: str, task: str, seed: int) -> Panel:
+def read_panel(store: Study, label: str, task: str, seed: int) -> Panel:
     """Read an episode and its recording, which is made if it is missing."""
     (row,) = [one for one in outcomes(store, task, seed) if one.label == label and one.episode is not None]
     found = find_episode(store.database, row.episode)
@@ -123,6 +123,6 @@ if __name__ == "__main__":
     parser.add_argument("settings", nargs="+")
     parser.add_argument("--results", type=Path, default=Path("results"))
     given = parser.parse_args()
-    study = StudyStore(opened(given.results), given.study)
+    study = Study(opened(given.results), given.study)
     given.out.write_bytes(make_film([read_panel(study, name, given.task, given.seed) for name in given.settings]))
     print(f"{given.out}: {given.out.stat().st_size // 1000} kB")

@@ -20,11 +20,11 @@ from kerv_cli.base.registry import find
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
 from kerv_cli.episodes.settings import RolloutSettings
-from kerv_cli.lab.database import opened
+from kerv_cli.lab.database import Database, opened
 from kerv_cli.lab.events import OnEvent, Outcome
-from kerv_cli.lab.plan import Setting, Study, all_episodes, plain_settings
+from kerv_cli.lab.plan import Setting, all_episodes, plain_settings
 from kerv_cli.lab.runs import Run
-from kerv_cli.lab.store import StudyStore, plan_study
+from kerv_cli.lab.store import Study
 from kerv_cli.lab.study import run_blocks
 from kerv_cli.lab.work import Prepare, RunEpisode
 from kerv_cli.worlds import settled
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 TOKENS = 16
+NOWHERE = Database("nowhere")
 IDENTITY = {"target": "a" * 64, "drafter": "b" * 64}
 
 
@@ -81,7 +82,7 @@ def study_of(
     repeats: int = 1,
     **about: Any,
 ) -> Study:
-    """A study of these settings, by label; `ar` is the baseline."""
+    """A study of these settings, by label; `ar` is the baseline. `plan_study` puts it into a database."""
     made = tuple(
         Setting(
             label,
@@ -93,7 +94,13 @@ def study_of(
         for label, one in settings.items()
     )
     about = {"baseline": "ar", "title": "Acceptance threshold", "axis": "threshold.r"} | about
-    return Study(name, made, all_episodes(made, tasks, block, repeats), block=block, **about)
+    episodes = all_episodes(made, tasks, block, repeats)
+    return Study(NOWHERE, name, "sweep", made, episodes, block=block, **about)
+
+
+def plan_study(database: Database, study: Study, *arguments: Any, **options: Any) -> Study:
+    """The study in a database, with what that has of it and what is missing."""
+    return replace(study, database=database).plan(*arguments, **options)
 
 
 def threshold_study(
@@ -111,14 +118,13 @@ def swept(
     rerun: str = "never",
     runtime: RuntimeSettings | None = None,
     on_event: OnEvent = lambda event: None,
-) -> tuple[StudyStore, Outcome]:
+) -> tuple[Study, Outcome]:
     """Runs what the database of a results folder lacks of a study."""
     command = ["sweep", f"study={study.name}"]
-    planned = plan_study(opened(results), study, rerun, runtime=runtime, command=command)
-    store = planned.store
+    study = plan_study(opened(results), study, rerun, runtime=runtime, command=command)
     prepare = prepare or episodes_of
-    with Run(store.database, study.kind, study.name, command, alone=False) as record, pretending(prepare):
-        return store, run_blocks(planned, prepare, record, on_event)
+    with Run(study.database, study.kind, study.name, command, alone=False) as record, pretending(prepare):
+        return study, run_blocks(study, prepare, record, on_event)
 
 
 @contextlib.contextmanager

@@ -27,7 +27,7 @@ from kerv_cli.board.app import make_app
 from kerv_cli.episodes.rows import episode_row, seconds_blob
 from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, SETTINGS, WANTED, now, opened
 from kerv_cli.lab.runs import Run
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.store import Study
 
 HERE = "http://127.0.0.1"
 TASKS = ["drawer-open-v3", "reach-v3"]
@@ -179,8 +179,8 @@ def test_pages_are_quick_with_ten_thousand_episodes_and_two_hundred_runs(tmp_pat
     study = threshold_study(["reach-v3", "drawer-open-v3"], 500, tuple(range(1, 9)), name="large")
     rows = [episode_row(episode(study.settings[3], "reach-v3", seed)) for seed in range(20)]
     values = {"started": now(), "block": "b", "decode_seconds": seconds_blob([0.01] * 20)}
-    store = StudyStore(opened(tmp_path), "large")
-    store.save(study)
+    store = replace(study, database=opened(tmp_path))
+    store.save()
     with Run(store.database, "sweep", "large", ["sweep"]):
         pass
     names = ("work", "task", "seed", "repeat")
@@ -296,7 +296,7 @@ def test_a_running_sweep_is_watched_until_it_ends(tmp_path, open_page, monkeypat
         page = open_page(address)
         assert "Nothing here yet" in page.locator("main").inner_text()
         sweep.start()
-        while not StudyStore(opened(tmp_path), "live").counts()[0]:
+        while not Study(opened(tmp_path), "live").counts()[0]:
             time.sleep(0.05)
         page.reload()
         page.locator(".pill", has_text=re.compile(r"running, \d+ of 24")).wait_for()

@@ -30,7 +30,7 @@ from kerv_cli.lab import database as module
 from kerv_cli.lab.command import STORE, noted
 from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, FILE, RUNS, STUDIES, WANTED, Database, opened
 from kerv_cli.lab.runs import Run, making, pulse, run_rows, time_left
-from kerv_cli.lab.store import StudyStore, studies
+from kerv_cli.lab.store import Study, studies
 from kerv_cli.report.tables import load_study
 from kerv_cli.training.demonstrations import open_demos
 
@@ -74,7 +74,7 @@ def damageable(tmp_path_factory):
 
 def test_reading_creates_nothing(database, tmp_path):
     assert studies(database) == run_rows(database) == []
-    assert StudyStore(opened(tmp_path), "threshold").counts() == (0, 0)
+    assert Study(opened(tmp_path), "threshold").counts() == (0, 0)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -154,13 +154,13 @@ def test_a_measure_that_an_older_kerv_did_not_store_is_missing_until_it_is_measu
     swept(tmp_path / "old", STUDY)
     with contextlib.closing(sqlite3.connect(tmp_path / "old" / FILE)) as file:
         file.execute("ALTER TABLE episodes DROP COLUMN closest_approach")
-    store = StudyStore(opened(tmp_path / "old"), "threshold")
+    store = Study(opened(tmp_path / "old"), "threshold")
     assert load_study(store).table["near_contact_failure"].isna().all()
     new = opened(tmp_path / "new")
     import_databases(new, [tmp_path / "old/kerv.db"])
-    assert StudyStore(new, "threshold").frame()["closest_approach"].isna().all()
+    assert Study(new, "threshold").frame()["closest_approach"].isna().all()
     swept(tmp_path / "old", study_of({"ar": settings_of("ar")}, ["push-v3"], "later"))
-    assert StudyStore(opened(tmp_path / "old"), "later").frame()["closest_approach"].notna().all()
+    assert Study(opened(tmp_path / "old"), "later").frame()["closest_approach"].notna().all()
     assert store.frame()["closest_approach"].isna().all()
 
 
@@ -191,7 +191,7 @@ def test_a_damaged_file_is_one_line(tmp_path, harm):
         return
     remedy = () if harm == "a folder" else ("is damaged", "restore a copy of it, or move it aside")
     with refused(str(path), *remedy):
-        StudyStore(opened(tmp_path), "threshold").frame()
+        Study(opened(tmp_path), "threshold").frame()
     result = kerv("runs", "list", f"results={tmp_path}", code=None)
     assert result.exit_code in (0, 1)
     assert "Traceback" not in result.output
@@ -292,7 +292,7 @@ def test_a_folder_that_cannot_be_written_to_can_be_read(tmp_path, monkeypatch):
     swept(tmp_path, STUDY)
     before = set(tmp_path.iterdir())
     monkeypatch.setattr(os, "access", lambda path, mode: mode != os.W_OK)
-    assert len(StudyStore(opened(tmp_path), "threshold").frame()) == 16
+    assert len(Study(opened(tmp_path), "threshold").frame()) == 16
     assert set(tmp_path.iterdir()) == before
     with refused("cannot use", "readonly", error=StorageError):
         begun(opened(tmp_path), "b")
@@ -401,7 +401,7 @@ def test_a_full_disk_keeps_what_was_committed(tmp_path):
             swept(tmp_path, study, filling)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    store = StudyStore(opened(tmp_path), "threshold")
+    store = Study(opened(tmp_path), "threshold")
     assert store.counts() == (8, 40)
     assert len(store.frame()) == 8
     swept(tmp_path, study)  # in this process, whose claim could not be released
@@ -410,10 +410,10 @@ def test_a_full_disk_keeps_what_was_committed(tmp_path):
 
 def test_a_study_that_is_not_there_names_what_to_run(database, tmp_path):
     with refused("no study 'threshold'", "run `kerv sweep study=threshold", error=UsageError):
-        StudyStore(opened(tmp_path), "threshold").load()
+        Study(opened(tmp_path), "threshold").load()
     for name in ("../up", "a/b", "", ".hidden"):
         with pytest.raises(UsageError, match="study name"):
-            StudyStore(opened(tmp_path), name)
+            Study(opened(tmp_path), name)
 
 
 def test_a_removed_study_leaves_nothing_but_what_others_want(database):

@@ -21,7 +21,7 @@ from kerv_cli.bench.settings import EstimateSettings
 from kerv_cli.engine.cost import Profile, prices, read_profile, work_of_record
 from kerv_cli.engine.record import DecodeRecord, Round
 from kerv_cli.lab.database import opened
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.store import Study
 from kerv_cli.report.profiles import open_profiles
 from kerv_cli.report.reprice import prices_table, repriced
 from kerv_cli.report.tables import load_study
@@ -319,7 +319,7 @@ def swept_results(tmp_path_factory):
     swept(results, threshold_study(["reach-v3", "push-v3"], radii=(9,)))
     words = (f"results={results}", "--json")
     (trace,) = json.loads(told("runs", "export", "threshold", "--to", "trace", *words))["written"]
-    store = StudyStore(opened(results), "threshold")
+    store = Study(opened(results), "threshold")
     rows = repriced(load_study(store), open_profiles(results, ["a100-openvla-7b-eager"]))
     return Path(trace), prices_table(rows).set_index("label").to_dict("index")
 

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,7 @@ from studies_synthetic import (
     episodes_of,
     misbehave,
     part,
+    plan_study,
     settings_of,
     study_of,
     swept,
@@ -35,10 +37,10 @@ from kerv_cli.cli.common import progress_bar
 from kerv_cli.cli.studies import event_printer, warnings_about
 from kerv_cli.lab.database import EPISODES, QUEUE, WANTED, Database, clock, opened
 from kerv_cli.lab.events import BlockStarted, EpisodeEnd, Event, Preparing, SettingFailed, Started
-from kerv_cli.lab.plan import Study, blocks_of
+from kerv_cli.lab.plan import blocks_of
 from kerv_cli.lab.progress import TimeLeft
 from kerv_cli.lab.queue import ClaimLost, Queue, enqueue
-from kerv_cli.lab.store import StudyStore, plan_study
+from kerv_cli.lab.store import Study
 from kerv_cli.lab.work import work
 from kerv_cli.lab.workers import LocalWorkers, gpus_in_turn
 from kerv_cli.report.tables import further_of, load_study
@@ -98,7 +100,7 @@ def test_each_episode_is_committed_when_it_ends(database):
 
     def on_event(event):
         if isinstance(event, EpisodeEnd):
-            told.append(StudyStore(opened(database.results), "threshold").counts())
+            told.append(Study(opened(database.results), "threshold").counts())
 
     store, _ = swept(database.results, STUDY, on_event=on_event)
     assert told == [(number, 16) for number in range(1, 17)]
@@ -142,7 +144,7 @@ def test_an_error_of_kerv_is_told_in_its_own_words(database):
 def test_a_study_that_is_deleted_while_it_runs_says_so(tmp_path, workers):
     def remove(event):
         if isinstance(event, EpisodeEnd):
-            StudyStore(opened(tmp_path), "threshold").remove()
+            Study(opened(tmp_path), "threshold").remove()
 
     with pytest.raises(KervError, match="threshold was deleted"):
         swept(tmp_path, STUDY, unhurried, runtime=RuntimeSettings(workers=workers), on_event=remove)
@@ -156,7 +158,7 @@ def test_a_sweep_goes_on_when_another_plans_fewer_episodes(database):
 
     def plan_fewer(event):
         if isinstance(event, EpisodeEnd):
-            StudyStore(database, "threshold").save(fewer)
+            replace(fewer, database=database).save()
 
     store, outcome = swept(database.results, STUDY, on_event=plan_fewer)
     assert (len(outcome.done), outcome.failed, store.counts()[1]) == (16, [], 4)
@@ -185,7 +187,7 @@ if all(children):
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_workers_of_a_killed_sweep_end_and_its_claims_are_taken_over(tmp_path, monkeypatch):
     monkeypatch.setattr("kerv_cli.lab.queue.LAPSE_SECONDS", 1.0)
-    store = StudyStore(opened(tmp_path), "threshold")
+    store = Study(opened(tmp_path), "threshold")
     with python(SWEEP, tmp_path, "slow_elsewhere", 2, 1) as process:  # the first task at once, the other in a minute
         until(lambda: store.counts()[0] == 6)
         until(lambda: queued(store.database) == 1)
@@ -199,11 +201,11 @@ def test_workers_of_a_killed_sweep_end_and_its_claims_are_taken_over(tmp_path, m
     assert (len(outcome.reused), len(outcome.done), queued(store.database)) == (6, 6, 0)
 
 
-def waiting(database: Database, study: Study, run: str = "run") -> StudyStore:
+def waiting(database: Database, study: Study, run: str = "run") -> Study:
     """Plan a study and queue its blocks, which nobody runs yet."""
-    plan = plan_study(database, study)
-    enqueue(plan, run)
-    return plan.store
+    study = plan_study(database, study)
+    enqueue(study, run)
+    return study
 
 
 def test_an_episode_takes_one_transaction(tmp_path, monkeypatch):
@@ -290,9 +292,9 @@ import sys
 import studies_synthetic as s
 from kerv_cli.lab import queue, work
 from kerv_cli.lab.database import opened
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.store import Study
 queue.LAPSE_SECONDS, queue.BEAT_SECONDS = 1.0, 0.1
-work.work(queue.Queue(StudyStore(opened(sys.argv[1]), "threshold")), s.stops)
+work.work(queue.Queue(Study(opened(sys.argv[1]), "threshold")), s.stops)
 """
 
 
@@ -315,7 +317,7 @@ import sys
 import pandas  # once, before the processes part; so are the calls below
 import studies_synthetic as s
 from kerv_cli.lab import database, queue, work
-from kerv_cli.lab.store import StudyStore, plan_study
+from kerv_cli.lab.store import Study
 from kerv_cli.lab.database import Database, opened
 
 work.POLL_SECONDS = 0.01
@@ -333,7 +335,7 @@ def parted(function, *arguments, **options):
 
 
 def begun(store):
-    return parted(lambda: work.work(queue.Queue(StudyStore(opened(results), store.name)), prepare))
+    return parted(lambda: work.work(queue.Queue(Study(opened(results), store.name)), prepare))
 
 
 def crew(store, number):
@@ -356,8 +358,8 @@ for workers in (1, 2, 4):
             setting.settings["seed"] = 100_000 + 100 * block + 10 * workers
         episodes = s.all_episodes(study.settings, ["reach-v3"], block)
         study = s.replace(study, episodes=episodes)
-        queue.enqueue(plan_study(opened(results), study), "run")
-        died = crew(StudyStore(opened(results), study.name), workers)
+        queue.enqueue(s.plan_study(opened(results), study), "run")
+        died = crew(Study(opened(results), study.name), workers)
         print(study.name, died)
 """
 
@@ -369,13 +371,13 @@ def test_any_number_of_workers_run_each_episode_once_though_some_are_killed(data
     assert (episodes(database), queued(database), errors(database)) == (9 * 10, 0, [])
     for workers in (1, 2, 4):
         for block in (1, 2, 5):
-            assert StudyStore(database, f"s{workers}{block}").counts() == (10, 10)
+            assert Study(database, f"s{workers}{block}").counts() == (10, 10)
 
 
 AT_ONCE = """
 study = s.threshold_study(["reach-v3", "push-v3"], episodes=4, radii=(3,), block=2)
-queue.enqueue(plan_study(opened(results), study), "earlier")
-store = StudyStore(opened(results), study.name)
+queue.enqueue(s.plan_study(opened(results), study), "earlier")
+store = Study(opened(results), study.name)
 children = [begun(store) for _ in range(3)] + [parted(s.swept, results, study, prepare) for _ in range(2)]
 assert [os.waitpid(child, 0)[1] for child in children] == [0] * 5
 """
@@ -385,14 +387,14 @@ def test_two_sweeps_and_three_workers_at_once_run_each_episode_once(database):
     with python(CREW + AT_ONCE, database.results, "brisk") as process:
         assert process.wait(60) == 0
     assert (episodes(database), queued(database)) == (24, 0)
-    assert StudyStore(database, "threshold").counts() == (24, 24)
+    assert Study(database, "threshold").counts() == (24, 24)
 
 
 def test_sweeps_at_once_run_each_episode_once(database):
     with python(SWEEP, database.results, "unhurried", 1, 4) as process:
         assert process.wait(60) == 0
     assert episodes(database) == 12
-    assert StudyStore(database, "threshold").counts() == (12, 12)
+    assert Study(database, "threshold").counts() == (12, 12)
     assert queued(database) == 0
 
 
@@ -402,7 +404,7 @@ def test_a_sweep_that_begins_in_the_middle_of_another_runs_nothing_twice(databas
     with ThreadPoolExecutor(1) as pool:
 
         def on_event(event):
-            if isinstance(event, EpisodeEnd) and not outcomes and StudyStore(database, "threshold").counts()[0] == 5:
+            if isinstance(event, EpisodeEnd) and not outcomes and Study(database, "threshold").counts()[0] == 5:
                 outcomes.append(pool.submit(swept, database.results, STUDY))
                 until(lambda: plan_study(database, STUDY).existing)
                 time.sleep(0.3)
@@ -471,8 +473,8 @@ def test_a_worker_counts_its_episodes_without_a_total(capsys):
 IN_ORDER = """
 from test_execute import in_order
 study = in_order()
-queue.enqueue(plan_study(opened(results), study), "run")
-assert crew(StudyStore(opened(results), study.name), 1) == 2
+queue.enqueue(s.plan_study(opened(results), study), "run")
+assert crew(Study(opened(results), study.name), 1) == 2
 """
 
 
@@ -480,7 +482,7 @@ def test_episodes_whose_order_counts_run_whole_again_when_their_process_dies(dat
     """A setting in which two workers die fails in the block."""
     with python(CREW + IN_ORDER, database.results, "killed_at_the_third") as process:
         assert process.wait(60) == 0
-    store = StudyStore(database, "threshold")
+    store = Study(database, "threshold")
     assert store.counts() == (2 + 4, 8)
     assert errors(database) == ["two workers died in this episode\n"] * 2
     frame = store.frame().query("label == 'heisd'")

@@ -16,7 +16,7 @@ from studies_synthetic import swept, threshold_study
 
 from kerv_cli.catalogue.imports import connect_foreign
 from kerv_cli.lab.database import opened
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.store import Study
 from kerv_cli.report.tables import load_study
 from kerv_cli.worlds.demos import files
 from kerv_cli.worlds.demos.files import foreign_table
@@ -47,8 +47,7 @@ def test_an_exported_database_is_the_study_elsewhere(made, tmp_path):
     told = answer("runs", "import", f"{tmp_path}/out/threshold/kerv.db", "name=copy", f"results={tmp_path}/new")
     assert told == {"studies": ["copy"], "notes": []}
     before, after = (
-        load_study(StudyStore(opened(folder), name))
-        for folder, name in ((made, "threshold"), (tmp_path / "new", "copy"))
+        load_study(Study(opened(folder), name)) for folder, name in ((made, "threshold"), (tmp_path / "new", "copy"))
     )
     pd.testing.assert_frame_equal(before.per_task.drop(columns="study"), after.per_task.drop(columns="study"))
     with sqlite3.connect(tmp_path / "out/threshold/kerv.db") as file:
@@ -60,7 +59,7 @@ def test_an_exported_database_is_the_study_elsewhere(made, tmp_path):
 def test_episodes_and_decodes_as_parquet(made, tmp_path):
     answer("runs", "export", "threshold", "--to", "parquet", "--dir", str(tmp_path), f"results={made}")
     episodes, decodes = (pd.read_parquet(tmp_path / f"threshold/{name}.parquet") for name in ("episodes", "decodes"))
-    assert len(episodes) == len(StudyStore(opened(made), "threshold").frame()) == 32
+    assert len(episodes) == len(Study(opened(made), "threshold").frame()) == 32
     counted = decodes.groupby(["label", "task", "seed", "repeat"]).size()
     assert counted.to_dict() == episodes.set_index(["label", "task", "seed", "repeat"])["decodes"].to_dict()
 

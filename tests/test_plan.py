@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 import pytest
 from conftest import raising
-from studies_synthetic import IDENTITY, part, settings_of, study_of, swept, threshold_study
+from studies_synthetic import IDENTITY, part, plan_study, settings_of, study_of, swept, threshold_study
 
 import kerv_cli
 from kerv_cli.base.config import compose
@@ -18,9 +18,9 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.episodes import identity
 from kerv_cli.episodes.identity import ENGINE, _meaning, code_hash, hash_of, work_of
 from kerv_cli.episodes.settings import RolloutSettings
-from kerv_cli.lab.plan import Block, Setting, Study, all_episodes, blocks_of, plain_settings
+from kerv_cli.lab.plan import Block, Setting, all_episodes, blocks_of, plain_settings
 from kerv_cli.lab.runs import interrupted_since
-from kerv_cli.lab.store import Plan, StudyStore, plan_study
+from kerv_cli.lab.store import Study
 from kerv_cli.report.summary import not_in_turn
 from kerv_cli.report.tables import load_study
 
@@ -49,7 +49,7 @@ def changed(path: str, value: Any) -> RolloutSettings:
     return settings
 
 
-def to_run(split: Plan) -> Found:
+def to_run(split: Study) -> Found:
     """(label, task) -> the seeds to run and why."""
     found: Found = {}
     for one, why in split.missing.items():
@@ -57,15 +57,15 @@ def to_run(split: Plan) -> Found:
     return found
 
 
-def why(split: Plan) -> set[str]:
+def why(split: Study) -> set[str]:
     return set(split.missing.values())
 
 
-def table_of(store: StudyStore) -> pd.DataFrame:
+def table_of(store: Study) -> pd.DataFrame:
     return load_study(store).table.query("averaging == 'micro over tasks'").set_index("label")
 
 
-def same_wanted(store: StudyStore, study: Study) -> bool:
+def same_wanted(store: Study, study: Study) -> bool:
     return {(one.setting.label, one.key) for one in store.load().episodes} == {
         (one.setting.label, one.key) for one in study.episodes
     }
@@ -279,7 +279,7 @@ def test_reasons_name_what_changed(database, monkeypatch):
 
     def reason(settings, task="reach-v3", weights=IDENTITY):
         setting = Setting("spec_vla r=3", "", plain_settings(asdict(settings)), weights)
-        split = plan_study(database, Study("threshold", (setting,), all_episodes([setting], [task])))
+        split = Study(database, "threshold", "sweep", (setting,), all_episodes([setting], [task])).plan()
         return next(iter(split.missing.values()), "")
 
     same = settings_of("spec_vla", 3)

@@ -16,7 +16,7 @@ from test_board import client_of
 from kerv_cli.engine.cost import Profile, prices, work_of_record
 from kerv_cli.episodes.rows import decode_records
 from kerv_cli.lab.database import opened
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.store import Study
 from kerv_cli.report.profiles import NamedProfile, open_profiles
 from kerv_cli.report.reprice import own_prices, prices_table, repriced, repriced_summary
 from kerv_cli.report.tables import load_study
@@ -45,7 +45,7 @@ def results(tmp_path_factory):
 
 @pytest.fixture
 def data(results):
-    return load_study(StudyStore(opened(results), "threshold"))
+    return load_study(Study(opened(results), "threshold"))
 
 
 def profile_file(results: Path, name: str = "there", without: str = "", **changes: Any) -> None:
@@ -82,7 +82,7 @@ def test_an_episode_costs_its_decodes_at_the_profiles_costs(data):
 
 def test_decodes_from_before_rounds_had_levels_cost_what_their_settings_say(data, monkeypatch):
     profiles = [NamedProfile("there", PROFILE)]
-    whole, decodes = repriced(data, profiles), data.store.decodes
+    whole, decodes = repriced(data, profiles), data.study.decodes
 
     def old(*arguments: Any) -> pa.Table:
         table = decodes(*arguments)
@@ -91,7 +91,7 @@ def test_decodes_from_before_rounds_had_levels_cost_what_their_settings_say(data
         rounds = pa.chunked_array([pa.array(table["rounds"].to_pylist(), pa.list_(pa.struct(fields)))])
         return table.set_column(place, "rounds", rounds)
 
-    monkeypatch.setattr(data.store, "decodes", old)
+    monkeypatch.setattr(Study, "decodes", lambda study, *arguments: old(*arguments))
     pd.testing.assert_frame_equal(prices_table(repriced(data, profiles)), prices_table(whole))
     table = old([int(data.episodes["episode"].iloc[-1])])
     assert {one.levels for decode in decode_records(table) for one in decode.rounds} == {0}

@@ -17,7 +17,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import RuntimeSettings, SlurmOptions
 from kerv_cli.lab.database import EPISODES, QUEUE, opened
 from kerv_cli.lab.events import EpisodeEnd
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.store import Study
 from kerv_cli.lab.study import Detached
 
 STUDY = threshold_study(["reach-v3", "push-v3"], episodes=6, radii=(3,), block=2)
@@ -117,7 +117,7 @@ s.swept(sys.argv[1], t.STUDY, s.unhurried, runtime=t.runtime())
 
 
 def test_a_study_survives_its_sweep_a_cancelled_worker_and_a_preempted_one(tmp_path):
-    store, struck = StudyStore(opened(tmp_path), "threshold"), []
+    store, struck = Study(opened(tmp_path), "threshold"), []
     with python(SWEEP, tmp_path) as process:
         until(lambda: store.counts()[0] >= 2, 120)
         process.kill()
@@ -151,7 +151,7 @@ def test_workers_are_left_alone_on_request_and_cancelled_by_an_interrupt(tmp_pat
     with pytest.raises(KeyboardInterrupt):
         swept(tmp_path, STUDY, runtime=asleep)
     until(lambda: not set(jobs()) & begun, 30)
-    with StudyStore(opened(tmp_path), "threshold").database.reading() as connection:
+    with Study(opened(tmp_path), "threshold").database.reading() as connection:
         assert connection.scalar(sa.select(sa.func.count()).select_from(QUEUE)) == 0
 
 

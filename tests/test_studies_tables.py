@@ -18,15 +18,15 @@ from conftest import refused
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
-from studies_synthetic import part, points_of, settings_of, still_episode, study_of, swept, threshold_study
+from studies_synthetic import part, plan_study, points_of, settings_of, still_episode, study_of, swept, threshold_study
 
 from kerv_cli.base.config import groups
 from kerv_cli.engine.record import DecodeRecord, Round
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab import database as tables
 from kerv_cli.lab.database import opened
-from kerv_cli.lab.plan import Episode, Setting, Study
-from kerv_cli.lab.store import StudyStore, plan_study
+from kerv_cli.lab.plan import Episode, Setting
+from kerv_cli.lab.store import Study
 from kerv_cli.lab.work import RunEpisode
 from kerv_cli.report.glossary import METHODS, UNVERIFIED, WORDS, explained
 from kerv_cli.report.page import render
@@ -366,7 +366,7 @@ def results(tmp_path_factory):
     folder = tmp_path_factory.mktemp("results")
     study = threshold_study(["reach-v3", "push-v3", "door-open-v3"], episodes=3)
     swept(folder, replace(study, episodes=study.episodes[:-3]))
-    StudyStore(opened(folder), "threshold").save(study, plan_study(opened(folder), study).existing)
+    plan_study(opened(folder), study).save()
     return folder
 
 
@@ -516,7 +516,7 @@ def test_one_run_of_one_commit_is_published_where_it_is_committed(tmp_path):
 def test_what_is_missing_or_not_committed_is_refused(tmp_path, commit):
     commit(f"{COMMIT}+changes")
     swept(tmp_path, replace(STUDY, episodes=STUDY.episodes[:-1]))
-    StudyStore(opened(tmp_path), "threshold").save(STUDY, plan_study(opened(tmp_path), STUDY).existing)
+    plan_study(opened(tmp_path), STUDY).save()
     with refused("1 of its episodes are missing", "not committed", error=Unpublishable):
         report(opened(tmp_path), "threshold", publish=True)
     assert not (tmp_path / "tables").exists()

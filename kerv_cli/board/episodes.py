@@ -17,7 +17,7 @@ from kerv_cli.board.pages import database_of, render
 from kerv_cli.catalogue.episodes import outcomes, settings_in
 from kerv_cli.episodes.identity import stress_of
 from kerv_cli.lab.plan import Setting
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.store import Study
 from kerv_cli.report.measures import NEAR
 from kerv_cli.report.tables import references_of
 
@@ -182,7 +182,7 @@ def _asked(request: Request) -> tuple[list[Cell], dict[str, Any]]:
     Raises:
         UnknownName: The study has no such setting or task.
     """
-    store = StudyStore(database_of(request), request.path_params["name"])
+    store = Study(database_of(request), request.path_params["name"])
     baseline, settings = settings_in(store)
     cells = cells_of(outcomes(store), baseline, settings)
     known = {"setting": list(settings), "task": sorted({cell.task for cell in cells})}

@@ -17,7 +17,7 @@ from kerv_cli.board.pages import database_of, render
 from kerv_cli.catalogue.entries import find_runs, parents
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import RUNNING, pulse, run_rows
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.store import Study
 
 _SHARE = 0.01
 """Largest share of each core's time for refreshing the page of a running study, so that its times are not disturbed."""
@@ -32,7 +32,7 @@ def _parts(database: Database, name: str, version: str, is_running: bool) -> tup
     Args:
         database: The database.
         name: Name of the study.
-        version: `StudyStore.version` of the study. A study is read again only if its version has changed.
+        version: `Study.version` of the study. A study is read again only if its version has changed.
         is_running: Whether it runs. If so, no cost model estimates its speeds, which would take time from it.
     """
     from kerv_cli.report.page import study_parts  # imports Altair, which takes a second
@@ -40,7 +40,7 @@ def _parts(database: Database, name: str, version: str, is_running: bool) -> tup
     from kerv_cli.report.tables import load_study
 
     began = time.thread_time()
-    data = load_study(StudyStore(database, name))
+    data = load_study(Study(database, name))
     parts = study_parts(data, priced=[] if is_running else prices_on(data, own_profiles(data)))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return parts, max(_SECONDS, (time.thread_time() - began) / (_SHARE * cores))
@@ -74,7 +74,7 @@ def show_study(request: Request) -> Response:
 def show_tables(request: Request) -> Response:
     """Show the report of a study: its verdict, tables and charts."""
     database, name = database_of(request), request.path_params["name"]
-    store = StudyStore(database, name)
+    store = Study(database, name)
     is_running = any(row.status == RUNNING for row in run_rows(database, store.kind, name))
     version = f"{store.version()}/{is_running}"
     if request.query_params.get("known") == version:

@@ -30,7 +30,7 @@ from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.lab.database import EPISODES, SETTINGS, STUDIES, WANTED, Database
 from kerv_cli.lab.plan import ALL, Episode
 from kerv_cli.lab.runs import COMPLETE, RUNNING, RunRow, forget, run_rows, time_left, unfinished
-from kerv_cli.lab.store import IMPORT, ROLLOUT, SWEEP, Plan, StudyStore, plan_study
+from kerv_cli.lab.store import IMPORT, ROLLOUT, SWEEP, Study
 from kerv_cli.targets.folders import shipped_dir
 
 LOG, WEIGHTS = "log.csv", "model.safetensors"
@@ -211,7 +211,7 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
     return [run for run in runs if agrees(run)]
 
 
-def store_of(run: RunEntry, database: Database) -> StudyStore:
+def store_of(run: RunEntry, database: Database) -> Study:
     """Return the stored study (settings and episodes) of an entry.
 
     Args:
@@ -223,7 +223,7 @@ def store_of(run: RunEntry, database: Database) -> StudyStore:
     """
     if not run.has_episodes:
         raise UsageError(f"{run.id} is a {run.kind}: it has no episodes")
-    return StudyStore(database, run.folder.name, run.kind)
+    return Study(database, run.folder.name, run.kind)
 
 
 def _studies(database: Database, rows: Mapping[tuple[str, str], RunRow]) -> list[RunEntry]:
@@ -257,7 +257,7 @@ def _studies(database: Database, rows: Mapping[tuple[str, str], RunRow]) -> list
             RunEntry(
                 id=study.name,
                 kind=study.kind,
-                folder=StudyStore(database, study.name, study.kind).root,
+                folder=Study(database, study.name, study.kind).root,
                 started=started[:23],
                 state=state,
                 methods=tuple(dict.fromkeys(one.method for one in compared)),
@@ -428,7 +428,7 @@ def again_words(run: RunEntry, results: str) -> list[str]:
     return ["runs", "rerun", run.id, *([] if results == CommandSettings().results else [f"results={results}"])]
 
 
-def plan_of(run: RunEntry, database: Database) -> Plan:
+def plan_of(run: RunEntry, database: Database) -> Study:
     """Plan to run a sweep or a rollout again. If an earlier repetition was interrupted, plan the rest of that one.
 
     Args:
@@ -450,11 +450,10 @@ def plan_of(run: RunEntry, database: Database) -> Plan:
     if row is not None:
         name = row.name
     elif study.kind == ROLLOUT:
-        name = new_name(database, study)
+        name = new_name(study)
     else:
         number, name = 1, f"{run.id}-again"
-        while StudyStore(database, name).exists:
+        while Study(database, name).exists:
             number += 1
             name = f"{run.id}-again{number}"
-    study = dataclasses.replace(study, name=name)
-    return plan_study(database, study, ALL, row.started if row else "", command=command)
+    return dataclasses.replace(study, name=name).plan(ALL, row.started if row else "", command=command)

@@ -13,13 +13,13 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.lab.database import BLOCKS, EPISODES, SETTINGS, STUDIES, WANTED, Database, measures_in
 from kerv_cli.lab.plan import Episode, Setting
-from kerv_cli.lab.store import StudyStore, setting_of
+from kerv_cli.lab.store import Study, setting_of
 
 LARGEST_ID = 2**31 - 1
 """Largest row number that PostgreSQL stores."""
 
 
-def settings_in(store: StudyStore) -> tuple[str, dict[str, Setting]]:
+def settings_in(store: Study) -> tuple[str, dict[str, Setting]]:
     """Return the baseline's label and all settings of a study by label, in the study's order.
 
     Raises:
@@ -33,7 +33,7 @@ def settings_in(store: StudyStore) -> tuple[str, dict[str, Setting]]:
         return row.about["baseline"], {one.label: setting_of(one) for one in connection.execute(query)}
 
 
-def outcomes(store: StudyStore, task: str = "", seed: int | None = None) -> list[Any]:
+def outcomes(store: Study, task: str = "", seed: int | None = None) -> list[Any]:
     """Return one row for every label, task and seed of a study, in the study's order.
 
     Of repeats (further measurements of the same episode) only the first is returned: all have the same outcome.
@@ -79,7 +79,7 @@ class FoundEpisode:
     """
 
     id: int
-    store: StudyStore
+    store: Study
     episode: Episode
     row: Mapping[str, Any]
     about: Mapping[str, Any]
@@ -124,5 +124,5 @@ def find_episode(database: Database, number: int) -> FoundEpisode:
         same = EPISODES.c.work == row.work, EPISODES.c.block == row.block, EPISODES.c.repeat == row.repeat
         before = sa.select(EPISODES.c.seed).where(*same, EPISODES.c.order < row.order).order_by(EPISODES.c.order)
         earlier = tuple(connection.scalars(before)) if setting.depends_on_order else ()
-    episode, store = Episode(setting, row.task, row.seed, row.repeat), StudyStore(database, row.study, row.kind)
+    episode, store = Episode(setting, row.task, row.seed, row.repeat), Study(database, row.study, row.kind)
     return FoundEpisode(number, store, episode, dict(row._mapping), row.about, earlier)

@@ -29,8 +29,8 @@ from kerv_cli.episodes.identity import ENGINE, OBSERVATION, flat
 from kerv_cli.episodes.rows import DECODE_SCHEMA, EPISODE_SCHEMA, INT, decodes_table, episode_row
 from kerv_cli.episodes.settings import RolloutSettings, settings_from
 from kerv_cli.lab.database import Database
-from kerv_cli.lab.plan import Episode, Setting, Study
-from kerv_cli.lab.store import IMPORT, ImportedEpisode, StudyStore
+from kerv_cli.lab.plan import Episode, Setting
+from kerv_cli.lab.store import IMPORT, ImportedEpisode, Study
 
 HARNESS = "vla-eval"
 """Name of the evaluation program."""
@@ -128,8 +128,8 @@ def import_evaluations(
     evaluations = [(label, one) for label, of_path in by_label.items() for one in of_path]
     benchmarks = list(dict.fromkeys(one.benchmark for _, one in evaluations))
     name = name or re.sub(r"\W+", "_", "-".join(benchmarks))[:80].strip("_") or "imported"
-    store = StudyStore(database, name)
-    if store.exists and store.kind != IMPORT:
+    stored = Study(database, name)
+    if stored.exists and stored.kind != IMPORT:
         raise UsageError(f"study '{name}' exists and was not imported: choose another with name=")
     baseline = baseline or ("ar" if "ar" in by_label else next(iter(by_label)))
     if baseline not in by_label:
@@ -142,13 +142,14 @@ def import_evaluations(
     }
     notes = [line for label, one in evaluations for line in _notes(label, one)]
     title = f"{HARNESS}: {', '.join(benchmarks)}"
-    study = Study(name, tuple(settings.values()), tuple(episodes), IMPORT, title, baseline, note="; ".join(notes))
+    about = title, baseline, "", "; ".join(notes)
+    study = Study(database, name, IMPORT, tuple(settings.values()), tuple(episodes), *about)
     existing = (
         _imported(database.results, episode, one, recorded)
         for episode, (one, recorded) in episodes.items()
         if recorded is not None
     )
-    StudyStore(database, name, IMPORT).add(study, existing, words)
+    study.add(existing, words)
     return name, notes
 
 

@@ -18,8 +18,8 @@ from kerv_cli.base.files import regular, write_folder
 from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.lab import database as tables
 from kerv_cli.lab.database import FILE, MEASURES, SCHEMA, Database, file_url, measures_in, newer
-from kerv_cli.lab.plan import Episode, Setting, Study
-from kerv_cli.lab.store import ImportedEpisode, StudyStore, stored_study
+from kerv_cli.lab.plan import Episode, Setting
+from kerv_cli.lab.store import ImportedEpisode, Study, stored_settings
 from kerv_cli.worlds.demos.files import foreign_table
 
 _DAMAGE = (sa.exc.SQLAlchemyError, sqlite3.Error, pa.ArrowException, OSError, ValueError, KeyError, TypeError,
@@ -71,16 +71,16 @@ def import_databases(database: Database, files: Sequence[Path], name: str = "") 
         if database.file is not None and file.resolve() == database.file.resolve():
             raise UsageError(f"{file} is the database to import into: name another folder with results=")
         with contextlib.ExitStack() as stack:
-            found = _in_database(file, stack)
+            found = _in_database(file, database, name, stack)
             if name and len(found) != 1:
                 raise UsageError(f"name={name}: {file} holds {len(found)} studies, and name= needs exactly one")
             for one in found:
-                store = StudyStore(database, name or one.study.name, one.study.kind)
-                if store.counts()[0]:
-                    notes.append(f"{store.name} exists and was left out: 'kerv runs rm {store.name}' removes it")
+                study = one.study
+                if study.counts()[0]:
+                    notes.append(f"{study.name} exists and was left out: 'kerv runs rm {study.name}' removes it")
                 else:
-                    store.add(one.study, one.episodes, one.command or ("runs", "import", str(file)))
-                    names.append(store.name)
+                    study.add(one.episodes, one.command or ("runs", "import", str(file)))
+                    names.append(study.name)
     return names, notes
 
 
@@ -133,8 +133,14 @@ def connect_foreign(path: Path, **options: Any) -> sqlite3.Connection:
     return connection
 
 
-def _in_database(path: Path, stack: contextlib.ExitStack) -> list[Found]:
+def _in_database(path: Path, database: Database, name: str, stack: contextlib.ExitStack) -> list[Found]:
     """Return the studies of a database file, which stays open until `stack` is closed.
+
+    Args:
+        path: The file.
+        database: The database to which they belong from now on.
+        name: Name that they get there. Empty: their own.
+        stack: Closes the file.
 
     Raises:
         CheckpointError: The file is damaged, or was written by a newer version of kerv.
@@ -148,15 +154,17 @@ def _in_database(path: Path, stack: contextlib.ExitStack) -> list[Found]:
         version = int(connection.scalar(sa.select(about.value).where(about.key == "schema_version")) or 0)
         if version > SCHEMA:
             raise newer(path, version)
-        found = [_stored(connection, row) for row in connection.execute(sa.select(tables.STUDIES)).all()]
+        rows = connection.execute(sa.select(tables.STUDIES)).all()
+        found = [_stored(connection, row, database, name) for row in rows]
     return [dataclasses.replace(one, episodes=_checked(path, one.episodes)) for one in found]
 
 
-def _stored(connection: sa.Connection, row: Any) -> Found:
-    """Return the study that a row of the table `studies` describes."""
-    study, settings = stored_study(connection, row)
+def _stored(connection: sa.Connection, row: Any, database: Database, name: str = "") -> Found:
+    """Return the study that a row of the table `studies` describes. It will be in `database`, with the name `name`."""
+    settings, episodes = stored_settings(connection, row.id)
+    study = Study(database, name or row.name, row.kind, tuple(settings.values()), episodes, **row.about)
     runs = tables.RUNS.c
-    newest = sa.select(runs.command).where(runs.kind == study.kind, runs.name == study.name)
+    newest = sa.select(runs.command).where(runs.kind == row.kind, runs.name == row.name)
     command = connection.scalar(newest.order_by(runs.started.desc(), runs.id.desc()).limit(1))
     return Found(study, _stored_episodes(connection, settings), tuple(command or ()))
 
@@ -203,7 +211,7 @@ def _damage(path: Path) -> Iterator[None]:
         raise CheckpointError(f"{path} is damaged, too large, or not a kerv.db: {why}") from error
 
 
-def export_database(store: StudyStore, folder: Path) -> Path:
+def export_database(study: Study, folder: Path) -> Path:
     """Write a kerv.db with a single study into a folder, and return the file. An existing kerv.db is replaced.
 
     Raises:
@@ -213,10 +221,10 @@ def export_database(store: StudyStore, folder: Path) -> Path:
 
     def fill(new: Path) -> None:
         copy = Database(new, file_url(new))
-        with store.database.reading() as connection:
-            row = connection.execute(sa.select(tables.STUDIES).where(tables.STUDIES.c.name == store.name)).one()
-            found = _stored(connection, row)
-            StudyStore(copy, store.name, store.kind).add(found.study, found.episodes, found.command)
+        with study.database.reading() as connection:
+            row = connection.execute(sa.select(tables.STUDIES).where(tables.STUDIES.c.name == study.name)).one()
+            found = _stored(connection, row, copy)
+            found.study.add(found.episodes, found.command)
         copy.close()
 
     if folder.is_dir() and any(path.name != FILE for path in folder.iterdir()):

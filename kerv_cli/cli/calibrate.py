@@ -81,14 +81,14 @@ def success(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_
 
     folder = folder_of(resolved)
     planned = planned_study(resolved, ["calibrate", "success", *overrides])
-    certificate = planned_certificate(resolved, planned.store, planned.study.episodes, settings)
+    certificate = planned_certificate(resolved, planned, planned.episodes, settings)
     if plan:
         print_study_plan(planned, as_json)
         return
-    with making(planned.store.database, "certificate", folder):
+    with making(planned.database, "certificate", folder):
         if run_study(planned).failed:
             raise typer.Exit(1)
-        certificate = certify(certificate, planned.store, planned.study.episodes, resolved.study.baseline)
+        certificate = certify(certificate, planned, planned.episodes, resolved.study.baseline)
         path = write(folder, certificate)
     rows = candidate_rows(certificate)
     if as_json:

@@ -35,7 +35,7 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
     from kerv_cli.catalogue.evaluations import import_evaluations
     from kerv_cli.catalogue.imports import database_in, import_databases
     from kerv_cli.lab.database import opened
-    from kerv_cli.lab.store import StudyStore
+    from kerv_cli.lab.store import Study
     from kerv_cli.report.summary import SummaryTable
     from kerv_cli.report.tables import load_study
 
@@ -55,7 +55,7 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
         return
     words = ["runs", "import", *names]
     name, notes = import_evaluations(database, paths, settings.name, settings.labels, settings.baseline, words)
-    data = load_study(StudyStore(database, name))
+    data = load_study(Study(database, name))
     if as_json:
         end_with_json({"study": name, "notes": notes, "settings": data.table})
     for line in notes:

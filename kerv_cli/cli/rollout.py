@@ -23,7 +23,7 @@ from kerv_cli.cli.studies import SECONDS_PER_EPISODE, planned_study, run_study
 from kerv_cli.episodes.settings import RolloutSettings
 
 if TYPE_CHECKING:
-    from kerv_cli.lab.store import StudyStore
+    from kerv_cli.lab.store import Study
 
 Many = Annotated[
     bool, typer.Option("-m", "--multirun", help="Run all combinations of settings with several values (a,b).")
@@ -53,32 +53,32 @@ def rollout(
     planned = planned_study(resolved, ["rollout", *(["-m"] if multirun else []), *overrides], is_rollout=True)
     if plan:
         names = ", ".join(f"{label}{stress_text(asdict(settings))}" for label, settings in resolved.settings.items())
-        total, tasks = len(planned.study.episodes), resolved.tasks
+        total, tasks = len(planned.episodes), resolved.tasks
         seconds = SECONDS_PER_EPISODE * total
         if as_json:
             end_with_json({"settings": list(resolved.settings), "tasks": tasks, "episodes": total, "seconds": seconds})
         typer.echo(f"{names}: {count(len(tasks), 'task')}, {count(total, 'episode')}, {about(seconds)}")
         return
     run_study(planned)
-    _print_rollout(planned.store, as_json, results_word(overrides))
+    _print_rollout(planned, as_json, results_word(overrides))
 
 
-def _print_rollout(store: StudyStore, as_json: bool, where: str) -> None:
+def _print_rollout(study: Study, as_json: bool, where: str) -> None:
     from kerv_cli.report.results import averaged, frame_of
     from kerv_cli.report.summary import SummaryTable, setting_tables
     from kerv_cli.report.tables import load_study
 
-    data = load_study(store)
+    data = load_study(study)
     if as_json:
-        end_with_json({"run": store.name, "folder": store.root, "settings": frame_of(averaged(data.results)),
-                       "tasks": data.per_task, "recordings": store.recordings})  # fmt: skip
+        end_with_json({"run": study.name, "folder": study.root, "settings": frame_of(averaged(data.results)),
+                       "tasks": data.per_task, "recordings": study.recordings})  # fmt: skip
     if len(data.study.labels) > 1:
         console().print(SummaryTable(data.results))
     else:
         for table in setting_tables(data):
             print_table(*table)
-    show = f"kerv runs show {store.name}{where}"
-    typer.echo(f"run {store.name} in {store.root}; its settings and figures: {show}")
-    if store.recordings:
-        first = shlex.quote(str(store.recordings[0]))
-        typer.echo(f"{count(len(store.recordings), 'recording')}; open one with: kerv view {first}")
+    show = f"kerv runs show {study.name}{where}"
+    typer.echo(f"run {study.name} in {study.root}; its settings and figures: {show}")
+    if study.recordings:
+        first = shlex.quote(str(study.recordings[0]))
+        typer.echo(f"{count(len(study.recordings), 'recording')}; open one with: kerv view {first}")

@@ -236,7 +236,7 @@ def rerun(
     from kerv_cli.report.compare import same_tokens
 
     planned = plan_of(run, database)
-    name = planned.store.name
+    name = planned.name
     if plan:
         end_with_plan(f"{run.id} again as {name}: {count(len(planned.to_run), 'episode')}", as_json)
     failed = run_study(planned).failed

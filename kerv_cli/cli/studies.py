@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from kerv_cli.episodes.resolve import ResolvedStudy
     from kerv_cli.lab.events import Event, Outcome
     from kerv_cli.lab.progress import TimeLeft
-    from kerv_cli.lab.store import Plan
+    from kerv_cli.lab.store import Study
     from kerv_cli.report.reprice import Priced
     from kerv_cli.report.tables import StudyData
 
@@ -34,7 +34,7 @@ BUSY = 1.2
 """Load average per core above which a line says that other programs disturb the measured times."""
 
 
-def planned_study(resolved: ResolvedStudy, command: Sequence[str], is_rollout: bool = False) -> Plan:
+def planned_study(resolved: ResolvedStudy, command: Sequence[str], is_rollout: bool = False) -> Study:
     """Plan a study or a rollout: find out which of its episodes must run. Print notes about it to standard error.
 
     The notes give the number of episodes, the overrides that have no effect, the tasks that the policy was not trained
@@ -72,8 +72,8 @@ def planned_study(resolved: ResolvedStudy, command: Sequence[str], is_rollout: b
     for task in dict.fromkeys(one.task for one in planned.to_run):
         spec_of(task).check_installed(resolved.first.policy.target)
     if is_rollout and planned.existing:
-        there, wanted = len(planned.existing), len(planned.study.episodes)
-        typer.echo(f"resuming {planned.store.name}: {there} of {wanted} episodes are there", err=True)
+        there, wanted = len(planned.existing), len(planned.episodes)
+        typer.echo(f"resuming {planned.name}: {there} of {wanted} episodes are there", err=True)
     return planned
 
 
@@ -94,7 +94,7 @@ def print_settings(resolved: ResolvedStudy) -> None:
         typer.echo(f"--- # {label}\n{settings_yaml(settings)}", nl=False)
 
 
-def print_study_plan(planned: Plan, as_json: bool, guess: float = SECONDS_PER_EPISODE) -> None:
+def print_study_plan(planned: Study, as_json: bool, guess: float = SECONDS_PER_EPISODE) -> None:
     """Print which episodes would run, why, and how long that would take. For the option --plan.
 
     Args:
@@ -104,24 +104,24 @@ def print_study_plan(planned: Plan, as_json: bool, guess: float = SECONDS_PER_EP
     """
     from kerv_cli.lab.progress import TimeLeft
 
-    rows, store, to_run, reused = _plan_rows(planned), planned.store, planned.to_run, planned.existing
+    rows, to_run, reused = _plan_rows(planned), planned.to_run, planned.existing
     left = TimeLeft(planned, guess)
     if as_json:
-        end_with_json({"study": store.name, "folder": store.root, "settings": rows, "to run": len(to_run),
+        end_with_json({"study": planned.name, "folder": planned.root, "settings": rows, "to run": len(to_run),
                        "reused": len(reused), "seconds": left.seconds, "source": left.source})  # fmt: skip
-    print_rows(rows, f"study {store.name}, episodes")
+    print_rows(rows, f"study {planned.name}, episodes")
     for warning in warnings_about(planned):
         typer.echo(f"kerv: warning: {warning}", err=True)
     typer.echo(f"{count(len(to_run), 'episode')} to run, {len(reused)} reused, {about(left.seconds, left.source)}")
 
 
-def _plan_rows(planned: Plan) -> list[dict[str, object]]:
+def _plan_rows(planned: Study) -> list[dict[str, object]]:
     """Return one table row per setting: numbers of missing and existing episodes, and why episodes will run."""
     from kerv_cli.lab.plan import seeds_text
 
     rows: list[dict[str, object]] = []
-    for label in planned.study.labels:
-        episodes = [one for one in planned.study.episodes if one.setting.label == label]
+    for label in planned.labels:
+        episodes = [one for one in planned.episodes if one.setting.label == label]
         reasons = [planned.missing[one] for one in episodes if one in planned.missing]
         rows.append(
             {
@@ -137,7 +137,7 @@ def _plan_rows(planned: Plan) -> list[dict[str, object]]:
     return rows
 
 
-def warnings_about(planned: Plan) -> list[str]:
+def warnings_about(planned: Study) -> list[str]:
     """Return what disturbs the times of a plan's episodes, a sentence each: workers that share a GPU or a CPU."""
     from kerv_cli.lab.workers import gpus_in_turn
 
@@ -154,7 +154,7 @@ def warnings_about(planned: Plan) -> list[str]:
     return [f"{runtime.workers} workers measure times and {shared} (docs/scale.md)"]
 
 
-def run_study(planned: Plan, guess: float = SECONDS_PER_EPISODE) -> Outcome:
+def run_study(planned: Study, guess: float = SECONDS_PER_EPISODE) -> Outcome:
     """Run the missing episodes of a plan and show the progress, with the time left.
 
     Args:
@@ -244,8 +244,8 @@ def print_study(data: StudyData, all_columns: bool = False, how: str = "", expla
     from kerv_cli.report.summary import SummaryTable, not_in_turn
     from kerv_cli.report.tables import split_values
 
-    store = data.store
-    how = how or f"kerv report study={store.name}{results_word(store.database.words)} --all"
+    study = data.study
+    how = how or f"kerv report study={study.name}{results_word(study.database.words)} --all"
     console().print(SummaryTable(data.results, all_columns, how))
     if explain:
         for name, text in explanations((one.label, one.settings["method"]) for one in data.study.settings).items():
@@ -257,7 +257,7 @@ def print_study(data: StudyData, all_columns: bool = False, how: str = "", expla
         typer.echo(f"its episodes are of {len(codes)} states of the code, commits {names}")
     apart = not_in_turn(data.results)
     if apart:
-        mend = "" if store.kind == "import" else f"; '{store.sweep_command('rerun=timed')}' does that"
+        mend = "" if study.kind == "import" else f"; '{study.sweep_command('rerun=timed')}' does that"
         typer.echo(f"no speedup of {', '.join(apart)}: not measured in turn with the baseline{mend}")
     if data.study.note:
         typer.echo(f"\n{data.study.note}\n")
@@ -282,18 +282,18 @@ def print_verdict(data: StudyData, loss: float) -> None:
     """
     from kerv_cli.report.verdict import caution, episodes_to_settle, order_of, verdict_of
 
-    store = data.store
+    study = data.study
     if order := order_of(data.by_speed):
         typer.echo(f"by speed per episode: {order}")
     if note := caution(data.results):
         typer.echo(f"note: {note}")
     typer.echo(f"verdict: {verdict_of(data.results, loss)[0]}")
-    if store.kind == "sweep" and (episodes := episodes_to_settle(data.results, loss)):
-        typer.echo(f"settle it: {store.sweep_command(f'episodes={episodes}')}")
-    typer.echo(f"page: {store.root / 'report.html'}")
-    typer.echo(f"browse: kerv board{results_word(store.database.words)}")
-    recordings = store.recordings
-    mend = "" if store.kind == "import" else "; the same sweep with record=1 rerun=all does that"
+    if study.kind == "sweep" and (episodes := episodes_to_settle(data.results, loss)):
+        typer.echo(f"settle it: {study.sweep_command(f'episodes={episodes}')}")
+    typer.echo(f"page: {study.root / 'report.html'}")
+    typer.echo(f"browse: kerv board{results_word(study.database.words)}")
+    recordings = study.recordings
+    mend = "" if study.kind == "import" else "; the same sweep with record=1 rerun=all does that"
     typer.echo(
         f"watch: {shlex.join(['kerv', 'view', str(recordings[0])]) if recordings else f'nothing is recorded{mend}'}"
     )

@@ -25,7 +25,7 @@ from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 if TYPE_CHECKING:
     from kerv_cli.episodes.resolve import ResolvedStudy
     from kerv_cli.lab.events import Outcome
-    from kerv_cli.lab.store import Plan
+    from kerv_cli.lab.store import Study
 
 
 @command(
@@ -53,11 +53,11 @@ def sweep(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_js
     if cfg:
         print_settings(resolved)
         return
-    planned = planned_study(resolved, ["sweep", *overrides])
+    study = planned_study(resolved, ["sweep", *overrides])
     if plan:
-        print_study_plan(planned, as_json, resolved.study.seconds)
+        print_study_plan(study, as_json, resolved.study.seconds)
         return
-    _print_outcome(run_study(planned, resolved.study.seconds), resolved, planned, as_json)
+    _print_outcome(run_study(study, resolved.study.seconds), resolved, study, as_json)
 
 
 def _list_studies(as_json: bool) -> None:
@@ -78,25 +78,25 @@ def _list_studies(as_json: bool) -> None:
     typer.echo("run one, e.g.: kerv sweep study=demo; what it would do: --plan")
 
 
-def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, planned: Plan, as_json: bool) -> None:
+def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, study: Study, as_json: bool) -> None:
     """Print the results of a sweep and end the command, with exit code 1 if episodes failed."""
     from kerv_cli.report.tables import load_study
 
     if outcome.detached:
-        missing = count(len(planned.to_run), "episode")
+        missing = count(len(study.to_run), "episode")
         text = f"{missing} to run: {outcome.detached}; the same command follows them"
         end_with_plan(text, as_json)
-    store, there = planned.store, [*outcome.done, *outcome.reused]
-    data = load_study(store, there) if there else None
+    there = [*outcome.done, *outcome.reused]
+    data = load_study(study, there) if there else None
     failed = sum(len(failure.episodes) for failure in outcome.failed)
     counts = {"run": len(outcome.done), "reused": len(outcome.reused), "failed": failed}
     for failure in outcome.failed:
         one = failure.episodes[0]
         typer.echo(f"kerv: {one.setting.label} on {one.task}: {failure.reason}", err=True)
     if as_json:
-        content = {"study": store.name, "folder": store.root, "episodes": counts}
+        content = {"study": study.name, "folder": study.root, "episodes": counts}
         content["settings"] = [] if data is None else data.table
-        end_with_json({**content, "recordings": store.recordings}, code=int(bool(failed)))
+        end_with_json({**content, "recordings": study.recordings}, code=int(bool(failed)))
     if data is not None:
         print_study(data)
     minutes = outcome.seconds / 60
@@ -109,8 +109,8 @@ def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, planned: Plan, as_
         from kerv_cli.report.reprice import own_prices
 
         # the study in the database may have more tasks, from earlier sweeps
-        is_whole = store.counts()[1] == len(data.study.episodes)
-        data = data if is_whole else load_study(store)
+        is_whole = study.counts()[1] == len(data.study.episodes)
+        data = data if is_whole else load_study(study)
         priced = own_prices(data)
         write_study(data, resolved.sweep.loss, priced)
         print_prices(priced)

@@ -23,7 +23,7 @@ def work(settings: WorkSettings) -> None:
     from kerv_cli.episodes.resolve import study_name
     from kerv_cli.lab.database import opened
     from kerv_cli.lab.events import EpisodeEnd, Event
-    from kerv_cli.lab.store import StudyStore
+    from kerv_cli.lab.store import Study
 
     if not settings.study:
         raise UsageError("of which study? name one, study=NAME: 'kerv runs list' shows them")
@@ -40,7 +40,7 @@ def work(settings: WorkSettings) -> None:
         ended += isinstance(event, EpisodeEnd)
         show(event)
 
-    store = StudyStore(opened(settings.results), study_name(settings.study))
+    store = Study(opened(settings.results), study_name(settings.study))
     try:
         work_on(store, settings.run, on_event, save_recording)
     except KeyboardInterrupt:

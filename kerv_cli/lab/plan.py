@@ -106,45 +106,6 @@ class Episode:
         return re.sub(r"[^\w.+-]", "_", name)[-200:]
 
 
-@dataclass(frozen=True)
-class Study:
-    """A comparison: the settings to compare, and all episodes to run with them.
-
-    Attributes:
-        name: Name in the database.
-        settings: The settings.
-        episodes: All episodes, in the order in which they run.
-        kind: sweep, rollout or import.
-        title: Title of the report.
-        baseline: Label of the setting that the others are compared with.
-        axis: Configuration key on the x axis of plots. Empty: no plot.
-        note: A sentence printed in the report.
-        block: Number of seeds in a block, which one process runs. For each of these seeds it runs all settings.
-        machines: Names of cost profiles of other machines, on which the report estimates the speeds.
-    """
-
-    name: str
-    settings: tuple[Setting, ...]
-    episodes: tuple[Episode, ...]
-    kind: str = "sweep"
-    title: str = ""
-    baseline: str = ""
-    axis: str = ""
-    note: str = ""
-    block: int = 5
-    machines: Sequence[str] = ()
-
-    @property
-    def labels(self) -> list[str]:
-        """Labels of the settings, in order."""
-        return [setting.label for setting in self.settings]
-
-    @property
-    def tasks(self) -> list[str]:
-        """Names of the tasks, in order."""
-        return list(dict.fromkeys(one.task for one in self.episodes))
-
-
 def all_episodes(
     settings: Sequence[Setting], tasks: Iterable[str], block: int = 5, repeats: int = 1
 ) -> tuple[Episode, ...]:
@@ -264,7 +225,8 @@ class Block:
 
 
 def split(
-    study: Study,
+    episodes: Sequence[Episode],
+    block: int,
     stored: Mapping[Key, Sequence[StoredEpisode]],
     rerun: str = NEVER,
     since: str = "",
@@ -273,7 +235,8 @@ def split(
     """Divide a study's episodes into existing and missing ones.
 
     Args:
-        study: The study.
+        episodes: The study's episodes.
+        block: Number of seeds that the study keeps together.
         stored: Episodes in the database, by `Episode.key`.
         rerun: Which existing episodes to run again: none (NEVER), those that did not take turns in one block (TIMED),
             those that other code ran (CHANGED), or all (ALL).
@@ -292,19 +255,19 @@ def split(
         return rerun != CHANGED or row.code == code_hash()
 
     usable: dict[Episode, list[StoredEpisode]] = {}
-    for one in study.episodes:
+    for one in episodes:
         usable[one] = list(filter(is_usable, stored.get(one.key, ())))
-    _keep_whole_orders(usable, study.block)
+    _keep_whole_orders(usable, block)
     existing: dict[Episode, StoredEpisode] = {}
-    for turn in _turns(study.episodes).values():
+    for turn in _turns(episodes).values():
         found = _rows_of_turn(turn, usable)
         if rerun != TIMED or (len(found) == len(turn) and len({row.block for row in found.values()}) == 1):
             existing |= found
-    for part in _ordered_parts(study.episodes, study.block):
+    for part in _ordered_parts(episodes, block):
         if not existing.keys() >= set(part):
             for one in part:
                 existing.pop(one, None)
-    return existing, _reasons(study, stored, existing, rerun, earlier or {})
+    return existing, _reasons(episodes, stored, existing, rerun, earlier or {})
 
 
 def _rows_of_turn(
@@ -322,7 +285,7 @@ def _rows_of_turn(
 
 
 def _reasons(
-    study: Study,
+    episodes: Sequence[Episode],
     stored: Mapping[Key, Sequence[StoredEpisode]],
     existing: Mapping[Episode, StoredEpisode],
     rerun: str,
@@ -337,7 +300,7 @@ def _reasons(
         return differences(setting, *earlier.get(setting.label, ()))
 
     reasons = {}
-    for one in study.episodes:
+    for one in episodes:
         if one in existing:
             continue
         if stored.get(one.key):

@@ -13,7 +13,7 @@ from kerv_cli.lab import events
 from kerv_cli.lab.database import EPISODES, PLANNED, SETTINGS, STUDIES, WANTED
 from kerv_cli.lab.plan import Episode
 from kerv_cli.lab.runs import Run
-from kerv_cli.lab.store import Plan, stored_episodes
+from kerv_cli.lab.store import Study
 from kerv_cli.lab.work import load_per_core
 
 
@@ -21,19 +21,19 @@ class Progress:
     """Collects the outcome of a plan: from the events of a worker in this process, and from the database.
 
     Args:
-        plan: The plan.
+        study: The study with its plan.
         record: The database row of the command.
         on_event: Called with each event, to show progress.
     """
 
-    def __init__(self, plan: Plan, record: Run, on_event: events.OnEvent) -> None:
-        self.plan, self.record, self.on_event = plan, record, on_event
-        self.outcome = events.Outcome(reused=list(plan.existing))
-        self._missing = {one.key: one for one in plan.to_run}
-        self._newest, self._began = plan.newest, time.perf_counter()
+    def __init__(self, study: Study, record: Run, on_event: events.OnEvent) -> None:
+        self.study, self.record, self.on_event = study, record, on_event
+        self.outcome = events.Outcome(reused=list(study.existing))
+        self._missing = {one.key: one for one in study.to_run}
+        self._newest, self._began = study.newest, time.perf_counter()
         record.beat(0, len(self._missing))
-        is_timed = any(block.batch == 1 for block in plan.blocks)
-        on_event(events.Started(len(self._missing), len(plan.existing), load_per_core() if is_timed else 0.0))
+        is_timed = any(block.batch == 1 for block in study.blocks)
+        on_event(events.Started(len(self._missing), len(study.existing), load_per_core() if is_timed else 0.0))
 
     def see(self, event: events.Event) -> None:
         """Take an event of a worker in this process."""
@@ -60,8 +60,8 @@ class Progress:
             self.see(failure)
 
     def _ended(self) -> list[events.EpisodeEnd]:
-        ended, store = [], self.plan.store
-        for key, rows in stored_episodes(store.database, self.plan.study, self._newest).items():
+        ended = []
+        for key, rows in self.study.stored(self._newest).items():
             self._newest, row = max(self._newest, rows[-1].id), rows[0]
             if one := self._missing.get(key):
                 ended.append(events.EpisodeEnd(one, row.success, row.seconds or 0.0, row.run != self.record.id))
@@ -70,9 +70,9 @@ class Progress:
     def _failed(self) -> list[events.SettingFailed]:
         columns = (SETTINGS.c.work, WANTED.c.task, WANTED.c.seed, WANTED.c.repeat, WANTED.c.error)
         query = sa.select(*columns).select_from(PLANNED).order_by(WANTED.c.position)
-        query = query.where(STUDIES.c.name == self.plan.store.name, WANTED.c.error.is_not(None))
+        query = query.where(STUDIES.c.name == self.study.name, WANTED.c.error.is_not(None))
         failed: dict[tuple[str, str, str], dict[Episode, None]] = {}
-        with self.plan.store.database.reading() as connection:
+        with self.study.database.reading() as connection:
             for *key, error in connection.execute(query):
                 if one := self._missing.get(tuple(key)):
                     failed.setdefault((key[0], key[1], error), {})[one] = None
@@ -90,8 +90,8 @@ class Progress:
         """
         self.look()
         if self._missing:
-            if not self.plan.store.exists:
-                name = self.plan.store.name
+            if not self.study.exists:
+                name = self.study.name
                 raise KervError(f"study {name} was deleted while it ran: run the same command to start it again")
             reason = "another command has planned the study anew, without it: run the same command again"
             self.see(events.SettingFailed(reason, episodes=tuple(self._missing.values())))
@@ -106,16 +106,16 @@ class TimeLeft:
     episodes. The workers share the total equally.
 
     Args:
-        plan: The plan.
+        study: The study with its plan.
         guess: Seconds per episode while nothing is measured.
     """
 
-    def __init__(self, plan: Plan, guess: float) -> None:
-        self.workers = max(1, min(plan.runtime.workers, len(plan.blocks)))
-        self._waiting = Counter(one.setting.work for one in plan.to_run)
-        self._guess, works = guess, {setting.work for setting in plan.study.settings}
+    def __init__(self, study: Study, guess: float) -> None:
+        self.workers = max(1, min(study.runtime.workers, len(study.blocks)))
+        self._waiting = Counter(one.setting.work for one in study.to_run)
+        self._guess, works = guess, {setting.work for setting in study.settings}
         query = sa.select(EPISODES.c.work, sa.func.avg(EPISODES.c.wall_seconds), sa.func.count(EPISODES.c.wall_seconds))
-        with plan.store.database.reading() as connection:
+        with study.database.reading() as connection:
             rows = connection.execute(query.where(EPISODES.c.work.in_(works)).group_by(EPISODES.c.work)).all()
         self._stored = {work: float(mean) for work, mean, _ in rows if mean is not None}
         self._ended: Counter[str] = Counter()

@@ -21,9 +21,9 @@ import sqlalchemy as sa
 
 from kerv_cli.base.errors import KervError, StorageError
 from kerv_cli.lab.database import QUEUE, SETTINGS, STUDIES, Unanswered, clock
-from kerv_cli.lab.plan import Block, Episode, Setting, StoredEpisode, Study, split
+from kerv_cli.lab.plan import Block, Episode, Setting, StoredEpisode, split
 from kerv_cli.lab.runs import is_running
-from kerv_cli.lab.store import ROLLOUT, Plan, StudyStore, setting_of, stored_episodes
+from kerv_cli.lab.store import ROLLOUT, Study, setting_of
 
 T = TypeVar("T")
 
@@ -65,25 +65,25 @@ def patiently(action: Callable[[], T]) -> T:
             time.sleep(min(1.0, PATIENCE_SECONDS / 10))
 
 
-def enqueue(plan: Plan, run: str) -> None:
-    """Write a plan's study and its blocks, in one transaction.
+def enqueue(study: Study, run: str) -> None:
+    """Write a planned study and its blocks, in one transaction.
 
     Blocks of the same tasks that an earlier command has planned are removed, unless that command or a worker still
     runs them.
 
     Args:
-        plan: The plan.
+        study: The study with its plan.
         run: Id of the command that made it.
     """
-    about = {"executor": plan.runtime.executor, "workers": plan.runtime.workers}
-    with plan.store.database.writing() as connection:
-        study = plan.store.save_in(connection, plan.study, plan.existing)
-        for row in connection.execute(sa.select(QUEUE).where(QUEUE.c.study_id == study, _is_free(connection))).all():
+    about = {"executor": study.runtime.executor, "workers": study.runtime.workers}
+    with study.database.writing() as connection:
+        number = study.save_in(connection)
+        for row in connection.execute(sa.select(QUEUE).where(QUEUE.c.study_id == number, _is_free(connection))).all():
             tasks = {task for _, task, *_ in row.episodes}
-            if tasks.issubset(plan.study.tasks) and not is_running(connection, row.run):
+            if tasks.issubset(study.tasks) and not is_running(connection, row.run):
                 connection.execute(sa.delete(QUEUE).where(QUEUE.c.id == row.id))
-        common = {"study_id": study, "run": run, "newest": plan.newest, "about": about}
-        rows = [{**common, "position": place, "episodes": block.keys} for place, block in enumerate(plan.blocks)]
+        common = {"study_id": number, "run": run, "newest": study.newest, "about": about}
+        rows = [{**common, "position": place, "episodes": block.keys} for place, block in enumerate(study.blocks)]
         if rows:
             connection.execute(sa.insert(QUEUE), rows)
 
@@ -117,12 +117,12 @@ class Queue:
     """The blocks of one study, as one worker sees them.
 
     Args:
-        store: The study.
+        study: The study.
         run: Only blocks that the command with this id has planned. Empty: all blocks of the study.
     """
 
-    def __init__(self, store: StudyStore, run: str = "") -> None:
-        self.store, self.run, self.database = store, run, store.database
+    def __init__(self, study: Study, run: str = "") -> None:
+        self.study, self.run, self.database = study, run, study.database
         self.worker = worker_id(os.getpid(), secrets.token_hex(4))
         self._claimed: int | None = None
         self._settings: dict[str, Setting] = {}  # those of earlier blocks, by their hashes
@@ -173,7 +173,7 @@ class Queue:
         query = sa.select(QUEUE.c.episodes).join(STUDIES, STUDIES.c.id == QUEUE.c.study_id)
         query = query.where(QUEUE.c.run != run, QUEUE.c.worker != self.worker, ~_is_free(connection))
         # rollouts share no episodes with other studies
-        query = query.where(self._mine() if self.store.kind == ROLLOUT else STUDIES.c.kind != ROLLOUT)
+        query = query.where(self._mine() if self.study.kind == ROLLOUT else STUDIES.c.kind != ROLLOUT)
         held: set[tuple[Any, ...]] = set()
         for episodes in connection.scalars(query):
             held.update(map(tuple, episodes))
@@ -184,7 +184,7 @@ class Queue:
         return sa.or_(_is_free(connection), QUEUE.c.worker == self.worker)
 
     def _mine(self) -> sa.ColumnElement[bool]:
-        study = sa.select(STUDIES.c.id).where(STUDIES.c.name == self.store.name).scalar_subquery()
+        study = sa.select(STUDIES.c.id).where(STUDIES.c.name == self.study.name).scalar_subquery()
         of_study: sa.ColumnElement[bool] = QUEUE.c.study_id == study
         return sa.and_(of_study, QUEUE.c.run == self.run) if self.run else of_study
 
@@ -202,9 +202,8 @@ class Queue:
         settings = self._settings_of(row)
         # a setting is missing if another command has planned the study anew, without it
         known = [Episode(settings[work], *rest) for work, *rest in row.episodes if work in settings]
-        study = Study(self.store.name, tuple(settings.values()), tuple(known), self.store.kind)
-        stored = stored_episodes(self.database, study, row.newest, Block(tuple(known))) if known else {}
-        existing, missing = split(study, stored)
+        stored = self.study.stored(row.newest, Block(tuple(known))) if known else {}
+        existing, missing = split(known, self.study.block, stored)
         guilty = next((one for one in missing if list(one.key) == killer), None)
         return Claim(row.id, row.run, row.about, Block(tuple(missing)), existing, guilty)
 

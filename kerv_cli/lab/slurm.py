@@ -57,9 +57,9 @@ class Array:
 
     def __init__(self, queue: Queue, runtime: RuntimeSettings, threads: int) -> None:
         self.queue, self.runtime, self.threads = queue, runtime, threads
-        self.logs = queue.store.root / "jobs"
+        self.logs = queue.study.root / "jobs"
         database = hashlib.sha256(queue.database.shown.encode()).hexdigest()[:8]
-        self.name = f"kerv-{queue.store.name}-{database}"
+        self.name = f"kerv-{queue.study.name}-{database}"
         self.id = self._running() or self._submitted()
         self._asked, self._done = time.monotonic(), -1
 

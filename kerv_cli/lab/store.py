@@ -1,4 +1,4 @@
-"""Stored studies: their settings and episodes in the database, and which episodes are missing."""
+"""A study: its settings and episodes, those of them that the database has, and those that are missing."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import functools
 import itertools
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +32,7 @@ from kerv_cli.lab.database import (
     measures_in,
     now,
 )
-from kerv_cli.lab.plan import NEVER, Block, Episode, Key, Setting, StoredEpisode, Study, blocks_of, split
+from kerv_cli.lab.plan import NEVER, Block, Episode, Key, Setting, StoredEpisode, blocks_of, split
 from kerv_cli.lab.runs import Run, run_rows
 
 if TYPE_CHECKING:
@@ -81,29 +81,83 @@ def _same_episode() -> sa.ColumnElement[bool]:
     return sa.and_(*of_setting, EPISODES.c.seed == WANTED.c.seed, EPISODES.c.repeat == WANTED.c.repeat)
 
 
-class StudyStore:
-    """One study in the database, and its folder with recordings and the report.
+@dataclass(frozen=True, eq=False)
+class Study:
+    """A comparison of several settings, in a database.
 
-    Args:
+    `Study(database, name)` alone names a study: `load` returns it with its settings and episodes. `plan` says which of
+    its episodes exist and which are missing.
+
+    Attributes:
         database: The database.
-        name: Name of the study.
-        kind: sweep, rollout or import. Empty: as stored in the database, or sweep if the study is not stored.
+        name: Name in the database.
+        kind: sweep, rollout or import. If left out: as stored in the database, or sweep if the study is not stored.
+        settings: The settings to compare.
+        episodes: All episodes, in the order in which they run.
+        title: Title of the report.
+        baseline: Label of the setting that the others are compared with.
+        axis: Configuration key on the x axis of plots. Empty: no plot.
+        note: A sentence printed in the report.
+        block: Number of seeds in a block, which one process runs. For each of these seeds it runs all settings.
+        machines: Names of cost profiles of other machines, on which the report estimates the speeds.
+        existing: Episodes that the database has, with their rows.
+        missing: Episodes to run, each with the reason in a few words, such as `new seeds`.
+        newest: Largest row number among the stored episodes. Larger ones were written after the plan, by other sweeps.
+        runtime: Executor, workers and device.
+        command: Command-line arguments (without `kerv`) that resume the study.
 
     Raises:
         UsageError: The name is not a plain folder name.
     """
 
-    def __init__(self, database: Database, name: str, kind: str = "") -> None:
-        self.database, self.name = database, check_name(name, "study name")
-        self._kind = kind
+    database: Database
+    name: str
+    kind: str = ""
+    settings: tuple[Setting, ...] = ()
+    episodes: tuple[Episode, ...] = ()
+    title: str = ""
+    baseline: str = ""
+    axis: str = ""
+    note: str = ""
+    block: int = 5
+    machines: Sequence[str] = ()
+    existing: Mapping[Episode, StoredEpisode] = field(default_factory=dict)
+    missing: Mapping[Episode, str] = field(default_factory=dict)
+    newest: int = 0
+    runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
+    command: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_name(self.name, "study name")
+        if not self.kind:
+            row = self._row()
+            object.__setattr__(self, "kind", SWEEP if row is None else row.kind)
 
     @property
-    def kind(self) -> str:
-        """How the study was made: sweep, rollout or import."""
-        if not self._kind:
-            row = self._row()
-            self._kind = SWEEP if row is None else row.kind
-        return self._kind
+    def labels(self) -> list[str]:
+        """Labels of the settings, in order."""
+        return [setting.label for setting in self.settings]
+
+    @property
+    def tasks(self) -> list[str]:
+        """Names of the tasks, in order."""
+        return list(dict.fromkeys(one.task for one in self.episodes))
+
+    @functools.cached_property
+    def to_run(self) -> list[Episode]:
+        """The episodes to run. An episode that several labels share runs once."""
+        return list({one.key: one for one in self.missing}.values())
+
+    @functools.cached_property
+    def blocks(self) -> list[Block]:
+        """The episodes to run in blocks, each of which one process runs. Blocks are ordered by their first episode."""
+        return blocks_of(self.to_run, self.block, self.runtime.workers)
+
+    @property
+    def device(self) -> str:
+        """Device of the episodes to run. Empty if they need different ones."""
+        devices = {str(one.setting.settings["runtime"]["device"]) for one in self.to_run}
+        return devices.pop() if len(devices) == 1 else ""
 
     @property
     def root(self) -> Path:
@@ -153,45 +207,100 @@ class StudyStore:
         """
         row = self._row()
         if row is None:
-            stored = [store.name for store in studies(self.database)]
+            stored = [study.name for study in studies(self.database)]
             hint = did_you_mean(self.name, stored) or "'kerv runs list' shows what is there"
             hint = self.how_to_run() if self.name in groups()["study"] else hint
             raise UsageError(f"no study '{self.name}' in {self.database.shown}: {hint}")
         with self.database.reading() as connection, self.database.checking(f"study {self.name}"):
-            return stored_study(connection, row)[0]
+            settings, episodes = stored_settings(connection, row.id)
+        return replace(self, kind=row.kind, settings=tuple(settings.values()), episodes=episodes, **row.about)
 
-    def save(self, study: Study, existing: Mapping[Episode, StoredEpisode] | None = None) -> None:
-        """Write a study's settings and episodes.
-
-        If the study is stored already, its unchanged settings keep their episodes of tasks that are not in `study`.
-        Episodes with a seed or repeat outside the ranges of `study` are removed from the study. So sweeps of one study
-        over different tasks give one report.
+    def plan(
+        self,
+        rerun: str = NEVER,
+        since: str = "",
+        runtime: RuntimeSettings | None = None,
+        command: Sequence[str] = (),
+    ) -> Study:
+        """Compare the episodes with the database. Return the study with its existing and missing episodes.
 
         Args:
-            study: The study.
-            existing: Episodes that the database already has, with their rows.
+            rerun: Which existing episodes to run again, as in `plan.split`.
+            since: Start of the interrupted command that is resumed, as in `plan.split`. Empty: none.
+            runtime: Executor, workers and device.
+            command: Command-line arguments (without `kerv`) that resume the study.
+        """
+        stored = self.stored()
+        existing, missing = split(self.episodes, self.block, stored, rerun, since, self._earlier())
+        newest = max((row.id for row in itertools.chain(*stored.values())), default=0)
+        runtime, command = runtime or RuntimeSettings(), tuple(command)
+        return replace(self, existing=existing, missing=missing, newest=newest, runtime=runtime, command=command)
+
+    def stored(self, newer_than: int = 0, block: Block | None = None) -> dict[Key, list[StoredEpisode]]:
+        """Return the stored episodes that the study may reuse, by `Episode.key`.
+
+        Sweeps do not reuse episodes of rollouts: no other setting took turns with them, so their times cannot be
+        compared.
+
+        Args:
+            newer_than: Return only rows with a larger row number.
+            block: Return only rows of this block's settings, tasks and seeds. None: of all the study's settings.
+        """
+        stored: dict[Key, list[StoredEpisode]] = {}
+        columns = (
+            EPISODES.c.work, EPISODES.c.task, EPISODES.c.seed, EPISODES.c.repeat, EPISODES.c.id, EPISODES.c.success,
+            EPISODES.c.wall_seconds, BLOCKS.c.id, BLOCKS.c.run, BLOCKS.c.started, BLOCKS.c.code, BLOCKS.c.seeds,
+        )  # fmt: skip
+        works = {setting.work for setting in (block or self).settings}
+        query = sa.select(*columns).join(BLOCKS, EPISODES.c.block == BLOCKS.c.id)
+        query = query.where(EPISODES.c.id > newer_than, EPISODES.c.work.in_(works))
+        if block is not None:
+            tasks = {one.task for one in block.episodes}
+            query = query.where(EPISODES.c.task.in_(tasks), EPISODES.c.seed.in_(block.seeds))
+        if self.kind != ROLLOUT:
+            query = query.outerjoin(RUNS, RUNS.c.id == BLOCKS.c.run)
+            query = query.where(sa.func.coalesce(RUNS.c.kind, "") != ROLLOUT)
+        with self.database.reading() as connection:
+            for work, task, seed, repeat, *row in connection.execute(query.order_by(EPISODES.c.id)):
+                stored.setdefault((work, task, seed, repeat), []).append(StoredEpisode(*row))
+        return stored
+
+    def _earlier(self) -> dict[str, tuple[Setting, str]]:
+        """Return, for each label, the newest stored setting that has episodes, and its hash `work`."""
+        ran = sa.select(WANTED.c.setting_id).where(WANTED.c.episode_id.is_not(None))
+        query = sa.select(SETTINGS).where(SETTINGS.c.label.in_(self.labels), SETTINGS.c.id.in_(ran))
+        with self.database.reading() as connection:
+            rows = connection.execute(query.order_by(SETTINGS.c.id))
+            return {row.label: (setting_of(row), row.work) for row in rows}
+
+    def save(self) -> None:
+        """Write the study's settings and episodes.
+
+        If the study is stored already, its unchanged settings keep their episodes of other tasks. Stored episodes with
+        a seed or repeat outside this study's ranges are removed from it. So sweeps of one study over different tasks
+        give one report.
         """
         with self.database.writing() as connection:
-            self.save_in(connection, study, existing or {})
+            self.save_in(connection)
 
-    def save_in(self, connection: sa.Connection, study: Study, existing: Mapping[Episode, StoredEpisode]) -> int:
+    def save_in(self, connection: sa.Connection) -> int:
         """Do what `save` does, in a transaction of the caller. Return the study's row number."""
-        about = {name: getattr(study, name) for name in ABOUT}
+        about = {name: getattr(self, name) for name in ABOUT}
         row = connection.execute(sa.select(STUDIES).where(STUDIES.c.name == self.name)).first()
         if row is None:
-            new = sa.insert(STUDIES).values(name=self.name, kind=study.kind, created=now(), about=about)
+            new = sa.insert(STUDIES).values(name=self.name, kind=self.kind, created=now(), about=about)
             row = connection.execute(new.returning(STUDIES)).one()
-        kept = study.labels if row.about["baseline"] == study.baseline else []
+        kept = self.labels if row.about["baseline"] == self.baseline else []
         mine = SETTINGS.c.study_id == row.id
         connection.execute(sa.delete(SETTINGS).where(mine, SETTINGS.c.label.not_in(kept)))
         connection.execute(sa.update(STUDIES).where(STUDIES.c.id == row.id).values(about=about))
         ids: dict[str, int] = {}
-        for position, setting in enumerate(study.settings):
+        for position, setting in enumerate(self.settings):
             ids[setting.label] = _save_setting(connection, row.id, position, setting)
-            planned = [one for one in study.episodes if one.setting.label == setting.label]
+            planned = [one for one in self.episodes if one.setting.label == setting.label]
             seeds, repeats = [one.seed for one in planned], [one.repeat for one in planned]
             still = sa.and_(
-                WANTED.c.task.not_in(study.tasks),
+                WANTED.c.task.not_in(self.tasks),
                 WANTED.c.seed.between(min(seeds, default=0), max(seeds, default=-1)),
                 WANTED.c.repeat <= max(repeats, default=-1),
             )
@@ -199,8 +308,8 @@ class StudyStore:
             connection.execute(sa.delete(WANTED).where(of_setting, sa.not_(still)))
         last = sa.select(sa.func.max(WANTED.c.position)).where(WANTED.c.setting_id.in_(ids.values()))
         rows, first = [], (connection.scalar(last) or 0) + 1
-        for position, one in enumerate(dict.fromkeys(study.episodes), first):
-            stored = existing.get(one)
+        for position, one in enumerate(dict.fromkeys(self.episodes), first):
+            stored = self.existing.get(one)
             key = {"setting_id": ids[one.setting.label], "task": one.task, "seed": one.seed, "repeat": one.repeat}
             rows.append({**key, "position": position, "episode_id": stored and stored.id})
         if rows:
@@ -301,18 +410,17 @@ class StudyStore:
                 tables.append(table.append_column("episode", pa.array([index] * table.num_rows, pa.int64())))
         return pa.concat_tables(tables, promote_options="default")
 
-    def add(self, study: Study, episodes: Iterable[ImportedEpisode], command: Sequence[str]) -> None:
-        """Write a study whose episodes were run elsewhere, in one transaction.
+    def add(self, episodes: Iterable[ImportedEpisode], command: Sequence[str]) -> None:
+        """Write the study, whose episodes were run elsewhere, in one transaction.
 
         Args:
-            study: The settings and all episodes.
             episodes: The episodes that were run, with their results.
             command: Command-line arguments (without `kerv`) of the import.
         """
         from kerv_cli.episodes.rows import seconds_blob, table_blob
 
-        with Run(self.database, study.kind, self.name, command) as record, self.database.writing() as connection:
-            self.save_in(connection, study, {})
+        with Run(self.database, self.kind, self.name, command) as record, self.database.writing() as connection:
+            self.save_in(connection)
             for one in episodes:
                 block = {"id": one.block, "seeds": one.seeds, "started": one.row.get("started") or now(),
                          "code": one.code, "about": one.about, "run": one.run or record.id}  # fmt: skip
@@ -413,125 +521,17 @@ def setting_of(row: Any) -> Setting:
     return Setting(check_label(row.label), row.overrides, row.settings, row.identity, row.varies, row.name)
 
 
-def stored_study(connection: sa.Connection, row: Any) -> tuple[Study, dict[int, Setting]]:
-    """Return the study that a row of the table `studies` describes, and its settings by their ids."""
-    query = sa.select(SETTINGS).where(SETTINGS.c.study_id == row.id).order_by(SETTINGS.c.position)
+def stored_settings(connection: sa.Connection, study: int) -> tuple[dict[int, Setting], tuple[Episode, ...]]:
+    """Return the settings of the study with this row number, by their ids, and its episodes."""
+    query = sa.select(SETTINGS).where(SETTINGS.c.study_id == study).order_by(SETTINGS.c.position)
     settings = {one.id: setting_of(one) for one in connection.execute(query)}
-    wanted = sa.select(WANTED).where(WANTED.c.setting_id.in_(settings)).order_by(WANTED.c.position)
-    episodes = tuple(
-        Episode(settings[one.setting_id], one.task, one.seed, one.repeat) for one in connection.execute(wanted)
-    )
-    return Study(row.name, tuple(settings.values()), episodes, row.kind, **row.about), settings
+    wanted = sa.select(WANTED.c.setting_id, WANTED.c.task, WANTED.c.seed, WANTED.c.repeat)
+    wanted = wanted.where(WANTED.c.setting_id.in_(settings)).order_by(WANTED.c.position)
+    return settings, tuple(Episode(settings[number], *rest) for number, *rest in connection.execute(wanted))
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What a study needs: its existing episodes, its missing episodes, and how to run them.
-
-    Attributes:
-        study: The study.
-        store: The study in the database.
-        existing: Episodes that the database has, with their rows.
-        missing: Episodes to run, each with the reason in a few words, such as `new seeds`.
-        newest: Largest row number among the stored episodes. Larger ones were written after the plan, by other sweeps.
-        runtime: Executor, workers and device.
-        command: Command-line arguments (without `kerv`) that resume the study.
-    """
-
-    study: Study
-    store: StudyStore
-    existing: Mapping[Episode, StoredEpisode]
-    missing: Mapping[Episode, str]
-    newest: int = 0
-    runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
-    command: tuple[str, ...] = ()
-
-    @functools.cached_property
-    def to_run(self) -> list[Episode]:
-        """The episodes to run. An episode that several labels share runs once."""
-        return list({one.key: one for one in self.missing}.values())
-
-    @property
-    def device(self) -> str:
-        """Device of the episodes to run. Empty if they need different ones."""
-        devices = {str(one.setting.settings["runtime"]["device"]) for one in self.to_run}
-        return devices.pop() if len(devices) == 1 else ""
-
-    @functools.cached_property
-    def blocks(self) -> list[Block]:
-        """The episodes to run in blocks, each of which one process runs. Blocks are ordered by their first episode."""
-        return blocks_of(self.to_run, self.study.block, self.runtime.workers)
-
-
-def plan_study(
-    database: Database,
-    study: Study,
-    rerun: str = NEVER,
-    since: str = "",
-    runtime: RuntimeSettings | None = None,
-    command: Sequence[str] = (),
-) -> Plan:
-    """Compare a study's episodes with the database, and return the plan to run the missing ones.
-
-    Args:
-        database: The database.
-        study: The study.
-        rerun: Which existing episodes to run again, as in `plan.split`.
-        since: Start of the interrupted command that is resumed, as in `plan.split`. Empty: none.
-        runtime: Executor, workers and device.
-        command: Command-line arguments (without `kerv`) that resume the study.
-    """
-    stored = stored_episodes(database, study)
-    existing, missing = split(study, stored, rerun, since, _earlier(database, study))
-    newest = max((row.id for row in itertools.chain(*stored.values())), default=0)
-    store = StudyStore(database, study.name, study.kind)
-    return Plan(study, store, existing, missing, newest, runtime or RuntimeSettings(), tuple(command))
-
-
-def stored_episodes(
-    database: Database, study: Study, newer_than: int = 0, block: Block | None = None
-) -> dict[Key, list[StoredEpisode]]:
-    """Return the stored episodes that a study may reuse, by `Episode.key`.
-
-    Sweeps do not reuse episodes of rollouts: no other setting took turns with them, so their times cannot be compared.
-
-    Args:
-        database: The database.
-        study: The study.
-        newer_than: Return only rows with a larger row number.
-        block: Return only rows of this block's settings, tasks and seeds. None: of all the study's settings.
-    """
-    stored: dict[Key, list[StoredEpisode]] = {}
-    columns = (
-        EPISODES.c.work, EPISODES.c.task, EPISODES.c.seed, EPISODES.c.repeat, EPISODES.c.id, EPISODES.c.success,
-        EPISODES.c.wall_seconds, BLOCKS.c.id, BLOCKS.c.run, BLOCKS.c.started, BLOCKS.c.code, BLOCKS.c.seeds,
-    )  # fmt: skip
-    works = {setting.work for setting in (block or study).settings}
-    query = sa.select(*columns).join(BLOCKS, EPISODES.c.block == BLOCKS.c.id)
-    query = query.where(EPISODES.c.id > newer_than, EPISODES.c.work.in_(works))
-    if block is not None:
-        tasks = {one.task for one in block.episodes}
-        query = query.where(EPISODES.c.task.in_(tasks), EPISODES.c.seed.in_(block.seeds))
-    if study.kind != ROLLOUT:
-        query = query.outerjoin(RUNS, RUNS.c.id == BLOCKS.c.run)
-        query = query.where(sa.func.coalesce(RUNS.c.kind, "") != ROLLOUT)
-    with database.reading() as connection:
-        for work, task, seed, repeat, *row in connection.execute(query.order_by(EPISODES.c.id)):
-            stored.setdefault((work, task, seed, repeat), []).append(StoredEpisode(*row))
-    return stored
-
-
-def _earlier(database: Database, study: Study) -> dict[str, tuple[Setting, str]]:
-    """Return, for each label of the study, the newest stored setting that has episodes, and its hash `work`."""
-    ran = sa.select(WANTED.c.setting_id).where(WANTED.c.episode_id.is_not(None))
-    query = sa.select(SETTINGS).where(SETTINGS.c.label.in_(study.labels), SETTINGS.c.id.in_(ran))
-    with database.reading() as connection:
-        rows = connection.execute(query.order_by(SETTINGS.c.id))
-        return {row.label: (setting_of(row), row.work) for row in rows}
-
-
-def studies(database: Database) -> list[StudyStore]:
+def studies(database: Database) -> list[Study]:
     """Return all studies in the database, newest first."""
     query = sa.select(STUDIES.c.name, STUDIES.c.kind).order_by(STUDIES.c.id.desc())
     with database.reading() as connection:
-        return [StudyStore(database, row.name, row.kind) for row in connection.execute(query)]
+        return [Study(database, row.name, row.kind) for row in connection.execute(query)]

@@ -22,12 +22,12 @@ from kerv_cli.episodes.runner import Request, Runner, close_worlds, is_recorded,
 from kerv_cli.episodes.settings import settings_from
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.events import Event, OnEvent, Outcome, SettingFailed
-from kerv_cli.lab.plan import ALL, Episode, Setting, Study, all_episodes, plain_settings
+from kerv_cli.lab.plan import ALL, Episode, Setting, all_episodes, plain_settings
 from kerv_cli.lab.progress import Progress
 from kerv_cli.lab.queue import Queue, enqueue
 from kerv_cli.lab.runs import Run, interrupted_since, unfinished
 from kerv_cli.lab.slurm import Array
-from kerv_cli.lab.store import ABOUT, ROLLOUT, SWEEP, Plan, StudyStore, plan_study
+from kerv_cli.lab.store import ABOUT, ROLLOUT, SWEEP, Study
 from kerv_cli.lab.work import Prepare, work
 from kerv_cli.lab.workers import LocalWorkers, follow, gpus_in_turn
 
@@ -72,11 +72,12 @@ class EpisodeRunner:
             yield request.key, result
 
 
-def study_of(resolved: ResolvedStudy, kind: str = SWEEP) -> Study:
+def study_of(resolved: ResolvedStudy, database: Database, kind: str = SWEEP) -> Study:
     """Check a study's settings, and return the study with all its episodes. `auto` devices are replaced by real ones.
 
     Args:
         resolved: The study with all its settings.
+        database: Where its results are.
         kind: SWEEP or ROLLOUT.
 
     Raises:
@@ -92,7 +93,7 @@ def study_of(resolved: ResolvedStudy, kind: str = SWEEP) -> Study:
     settings.sort(key=lambda setting: setting.label != about.baseline)
     episodes = all_episodes(settings, resolved.tasks, about.block, about.repeats)
     own = {name: getattr(about, name) for name in ABOUT}
-    return Study(about.name, tuple(settings), episodes, kind, **own)
+    return Study(database, about.name, kind, tuple(settings), episodes, **own)
 
 
 def _device_of(runtime: RuntimeSettings) -> str:
@@ -128,7 +129,7 @@ def checked(setting: Setting, tasks: list[str], results: str) -> Setting:
     return replace(setting, settings=stored, identity=identity)
 
 
-def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], kind: str = SWEEP) -> Plan:
+def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], kind: str = SWEEP) -> Study:
     """Find out which episodes of a sweep or a rollout are in the database, and which must run.
 
     A rollout is a new one each time. But if the same command was interrupted before, the rest of its newest rollout is
@@ -149,30 +150,30 @@ def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], ki
     if kind == SWEEP and runtime.detach and runtime.executor != SLURM:
         raise UsageError("runtime.detach=true is for clusters: add runtime.executor=slurm")
     check_writable(str(database.results))
-    study = study_of(resolved, kind)
+    study = study_of(resolved, database, kind)
     if kind == SWEEP:
         since = interrupted_since(database, SWEEP, study.name, command) if rerun == ALL else ""
-        return plan_study(database, study, rerun, since, runtime, command)
+        return study.plan(rerun, since, runtime, command)
     runtime = replace(runtime, workers=1, executor="local")
     if row := unfinished(database, ROLLOUT, command):
-        rest = plan_study(database, replace(study, name=row.name), ALL, row.started, runtime, command)
-        if rest.store.exists and rest.existing and rest.missing:
+        rest = replace(study, name=row.name).plan(ALL, row.started, runtime, command)
+        if rest.exists and rest.existing and rest.missing:
             return rest
-    return plan_study(database, replace(study, name=new_name(database, study)), ALL, "", runtime, command)
+    return replace(study, name=new_name(study)).plan(ALL, "", runtime, command)
 
 
-def new_name(database: Database, study: Study) -> str:
+def new_name(study: Study) -> str:
     """Return a name for a new rollout, with date, time and methods: `20260301-142530-ar-spec_vla`."""
     methods = "-".join(dict.fromkeys(str(setting.settings["method"]) for setting in study.settings))
     name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{re.sub(r'[^A-Za-z0-9_.-]', '_', methods)[:32]}"
-    return f"{name}-{secrets.token_hex(2)}" if StudyStore(database, name).exists else name
+    return f"{name}-{secrets.token_hex(2)}" if replace(study, name=name).exists else name
 
 
-def run(planned: Plan, on_event: OnEvent = lambda event: None, *, save: Save = lambda *_: None) -> Outcome:
+def run(study: Study, on_event: OnEvent = lambda event: None, *, save: Save = lambda *_: None) -> Outcome:
     """Run the missing episodes of a plan. Each is saved in the database as soon as it ends.
 
     Args:
-        planned: The plan.
+        study: The study with its plan.
         on_event: Called with each event, to show progress.
         save: Writes a recording. The default writes nothing.
 
@@ -181,54 +182,54 @@ def run(planned: Plan, on_event: OnEvent = lambda event: None, *, save: Save = l
         KervError: An episode of a rollout failed.
         StorageError: The disk is full or not writable.
     """
-    store, is_rollout = planned.store, planned.study.kind == ROLLOUT
+    is_rollout = study.kind == ROLLOUT
 
     def forward(event: Event) -> None:
         if isinstance(event, SettingFailed) and is_rollout:
             raise event.error or KervError(event.reason)
         on_event(event)
 
-    prepare = EpisodeRunner(store.rollouts, save)
+    prepare = EpisodeRunner(study.rollouts, save)
     try:
-        with Run(store.database, planned.study.kind, store.name, planned.command, alone=is_rollout) as record:
+        with Run(study.database, study.kind, study.name, study.command, alone=is_rollout) as record:
             try:
-                return run_blocks(planned, prepare, record, forward)
+                return run_blocks(study, prepare, record, forward)
             except KeyboardInterrupt:
                 raise Interrupted(
-                    f"interrupted: {_kept(store)} of {store.name} are kept: run the same command to resume"
+                    f"interrupted: {_kept(study)} of {study.name} are kept: run the same command to resume"
                 ) from None
             finally:
                 close_worlds()
     except Detached as detached:
-        return Outcome(reused=list(planned.existing), detached=str(detached))
+        return Outcome(reused=list(study.existing), detached=str(detached))
 
 
 class Detached(Interrupted):
     """The workers of a cluster go on without this command. The message says which."""
 
 
-def run_blocks(planned: Plan, prepare: Prepare, record: Run, on_event: OnEvent) -> Outcome:
+def run_blocks(study: Study, prepare: Prepare, record: Run, on_event: OnEvent) -> Outcome:
     """Queue the blocks of a plan, and run them: in this process, in worker processes, or on a cluster.
 
     However it ends, no process of this machine runs a block after that, and none of the plan's blocks stays queued.
     Only a cluster's workers go on if this process is killed.
 
     Args:
-        planned: The plan.
+        study: The study with its plan.
         prepare: Builds a setting's decoder for a task. Used in this process only.
         record: The database row of this command.
         on_event: Called with each event, to show progress.
     """
-    runtime, blocks = planned.runtime, planned.blocks
-    queue, progress = Queue(planned.store, record.id), Progress(planned, record, on_event)
-    enqueue(planned, record.id)
-    threads = max((one.setting.settings["runtime"]["threads"] for one in planned.to_run), default=1)
+    runtime, blocks = study.runtime, study.blocks
+    queue, progress = Queue(study, record.id), Progress(study, record, on_event)
+    enqueue(study, record.id)
+    threads = max((one.setting.settings["runtime"]["threads"] for one in study.to_run), default=1)
     try:
         if blocks and runtime.executor == SLURM:
             _follow_cluster(Array(queue, runtime, threads), progress)
         elif blocks and runtime.workers > 1:
             number = min(runtime.workers, len(blocks))
-            with LocalWorkers(queue, number, threads, gpus_in_turn(planned.device)) as workers:
+            with LocalWorkers(queue, number, threads, gpus_in_turn(study.device)) as workers:
                 follow(queue, progress, workers.tend)
         elif blocks:
             work(queue, prepare, progress.see)
@@ -257,11 +258,11 @@ def _follow_cluster(array: Array, progress: Progress) -> None:
         raise
 
 
-def work_on(store: StudyStore, run_id: str, on_event: OnEvent, save: Save) -> None:
+def work_on(study: Study, run_id: str, on_event: OnEvent, save: Save) -> None:
     """Run blocks of a study that a sweep has planned, until none is left. For `kerv work`.
 
     Args:
-        store: The study.
+        study: The study.
         run_id: Only blocks of the command with this id. Empty: all.
         on_event: Called with each event, to show progress.
         save: Writes a recording.
@@ -272,19 +273,19 @@ def work_on(store: StudyStore, run_id: str, on_event: OnEvent, save: Save) -> No
         StorageError: The disk is full or not writable, or the database does not answer.
     """
     if not run_id:  # a sweep of this machine has checked its settings
-        study = store.load()
+        study = study.load()
         for setting in study.settings:
             set_up(settings_from(setting.on(study.tasks[0])).runtime)
-            checked(setting, study.tasks, str(store.database.results))
+            checked(setting, study.tasks, str(study.database.results))
     try:
-        work(Queue(store, run_id), EpisodeRunner(store.rollouts, save), on_event)
+        work(Queue(study, run_id), EpisodeRunner(study.rollouts, save), on_event)
     finally:
         close_worlds()
 
 
-def _kept(store: StudyStore) -> str:
+def _kept(study: Study) -> str:
     """Return how many episodes of a study are stored, as text. If the database does not answer: `all complete …`."""
     try:
-        return "{} of {} episodes".format(*store.counts())
+        return "{} of {} episodes".format(*study.counts())
     except StorageError:
         return "all complete episodes"

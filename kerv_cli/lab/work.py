@@ -151,7 +151,7 @@ class _Attempt:
         with self.queue.database.writing() as connection:
             self.queue.hold(connection, self.claim)
             for one, row in self.claim.existing.items():
-                self.queue.store.update(connection, one, episode_id=row.id, error=None)
+                self.queue.study.update(connection, one, episode_id=row.id, error=None)
 
     def _take_turns(self) -> None:
         runners: dict[str, RunEpisode] = {}
@@ -226,7 +226,7 @@ class _Attempt:
         with self.queue.database.writing() as connection:
             self.queue.hold(connection, self.claim, self.running)
             # it is there already if it was committed, but the answer was lost
-            self.queue.store.write(connection, one, block, row, decodes)
+            self.queue.study.write(connection, one, block, row, decodes)
 
     @functools.cached_property
     def _row(self) -> dict[str, Any]:
@@ -260,4 +260,4 @@ class _Attempt:
         with self.queue.database.writing() as connection:
             self.queue.hold(connection, self.claim, episodes=rest)
             for one in failed:
-                self.queue.store.update(connection, one, error=f"{failure.reason}\n{failure.trace}")
+                self.queue.study.update(connection, one, error=f"{failure.reason}\n{failure.trace}")

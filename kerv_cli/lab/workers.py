@@ -39,7 +39,7 @@ def worker_command(queue: Queue, threads: int, **settings: str) -> tuple[list[st
         **settings: Further settings of `kerv work`.
     """
     results = str(queue.database.results.absolute())
-    words = as_overrides(study=queue.store.name, results=results, **settings)
+    words = as_overrides(study=queue.study.name, results=results, **settings)
     environment = os.environ | dict.fromkeys(THREAD_VARIABLES, str(threads)) | {STORE: queue.database.store}
     return [sys.executable, "-m", "kerv_cli", "work", *words], environment
 
@@ -79,7 +79,7 @@ def follow(queue: Queue, progress: Progress, tend: Callable[[], None]) -> None:
         for position, worker in patiently(queue.claimed):
             if (position, worker) not in shown:
                 shown.add((position, worker))
-                progress.on_event(BlockStarted(progress.plan.blocks[position]))
+                progress.on_event(BlockStarted(progress.study.blocks[position]))
         patiently(progress.look)
         time.sleep(_POLL_SECONDS)
 

@@ -28,7 +28,7 @@ from kerv_cli.episodes.resolve import ResolvedStudy
 from kerv_cli.episodes.settings import WAITS, RolloutSettings
 from kerv_cli.lab.database import SETTINGS, STUDIES, WANTED, now
 from kerv_cli.lab.plan import Episode, seeds_text
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.store import Study
 from kerv_cli.methods.certified.certificate import Attempt, Candidate, Certificate, CertificateArtifact
 from kerv_cli.methods.compose import Method
 from kerv_cli.report.betting import p_value
@@ -99,7 +99,7 @@ def _check_conditions(resolved: ResolvedStudy) -> None:
 
 
 def planned_certificate(
-    resolved: ResolvedStudy, store: StudyStore, wanted: Sequence[Episode], settings: CalibrateSuccessSettings
+    resolved: ResolvedStudy, store: Study, wanted: Sequence[Episode], settings: CalibrateSuccessSettings
 ) -> Certificate:
     """Return the certificate of a test that has not run: it says what will be tested, in which order and how.
 
@@ -144,7 +144,7 @@ def planned_certificate(
 
 
 def charged(
-    certificate: Certificate, store: StudyStore, episodes: Sequence[Episode], paths: Iterable[Path], again: bool
+    certificate: Certificate, store: Study, episodes: Sequence[Episode], paths: Iterable[Path], again: bool
 ) -> Certificate:
     """Set the error probability of a planned test, and record the policy's earlier tests.
 
@@ -200,7 +200,7 @@ def attempts_on(target: str, folders: Iterable[Path]) -> list[Attempt]:
     return sorted(found, key=lambda one: one.made)
 
 
-def _other_study(target: str, store: StudyStore, episodes: Sequence[Episode]) -> str:
+def _other_study(target: str, store: Study, episodes: Sequence[Episode]) -> str:
     """Return the name of another study in which the policy ran some of these episodes. Empty if there is none."""
     wanted = {(one.task, one.seed) for one in episodes}
     seeds = {seed for _, seed in wanted}
@@ -217,7 +217,7 @@ def _other_study(target: str, store: StudyStore, episodes: Sequence[Episode]) ->
     return ""
 
 
-def certify(certificate: Certificate, store: StudyStore, wanted: Sequence[Episode], baseline: str) -> Certificate:
+def certify(certificate: Certificate, store: Study, wanted: Sequence[Episode], baseline: str) -> Certificate:
     """Test the candidates in their order, each at level delta, until one fails.
 
     Return the certificate with the results. By fixed-sequence testing, the probability that any certified setting

@@ -11,7 +11,7 @@ from kerv_cli.catalogue.entries import RunEntry, description_of, find_run, store
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, without
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.plan import seeds_text
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.store import Study
 from kerv_cli.report.measures import measure, paired
 from kerv_cli.report.results import Row, is_number
 from kerv_cli.report.statistics import Estimate
@@ -177,7 +177,7 @@ def _interval(change: Estimate, what: str) -> Row:
     return {"change": change.value, "low": change.low, "high": change.high, "what": what}
 
 
-def same_tokens(first: StudyStore, second: StudyStore) -> tuple[int, int]:
+def same_tokens(first: Study, second: Study) -> tuple[int, int]:
     """Return how many of the shared episodes have equal tokens, and how many episodes the two studies share.
 
     Raises:
@@ -187,7 +187,7 @@ def same_tokens(first: StudyStore, second: StudyStore) -> tuple[int, int]:
     return int((shared["tokens_x"] == shared["tokens_y"]).sum()), len(shared)
 
 
-def _tokens(store: StudyStore) -> pd.DataFrame:
+def _tokens(store: Study) -> pd.DataFrame:
     """Return a row per episode: label, task, seed, repeat, and the tokens of all its decodes."""
     frame = store.frame()[["episode", "label", "task", "seed", "repeat"]]
     decodes = store.decodes(frame["episode"].tolist(), ["tokens"]).to_pandas()  # `episode` is a position in the list

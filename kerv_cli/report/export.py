@@ -17,7 +17,7 @@ from kerv_cli.engine.cost import READ_PHASES
 from kerv_cli.engine.record import PARALLEL
 from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.lab.database import Database
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.store import Study
 from kerv_cli.report.reprice import levels_of
 from kerv_cli.report.results import csv_text
 from kerv_cli.targets.compact.settings import prompt_tokens
@@ -59,15 +59,15 @@ def export(run: RunEntry, database: Database, to: str, folder: Path) -> list[Pat
     return [path]
 
 
-def _episodes(store: StudyStore) -> pd.DataFrame:
-    """Return the table of a study's episodes that `StudyStore.frame` makes. Raise UsageError if there are none."""
+def _episodes(store: Study) -> pd.DataFrame:
+    """Return the table of a study's episodes that `Study.frame` makes. Raise UsageError if there are none."""
     frame = store.frame()
     if frame.empty:
         raise UsageError(f"study '{store.name}' has no episode yet: {store.how_to_run()}")
     return frame
 
 
-def _to_parquet(store: StudyStore, folder: Path, labels: Mapping[str, str]) -> list[Path]:
+def _to_parquet(store: Study, folder: Path, labels: Mapping[str, str]) -> list[Path]:
     """Write all episodes of a study, with the run's labels, to episodes.parquet and all decodes to decodes.parquet."""
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -89,7 +89,7 @@ def _to_parquet(store: StudyStore, folder: Path, labels: Mapping[str, str]) -> l
     return [episodes, decodes]
 
 
-def _to_trace(store: StudyStore, path: Path) -> Path:
+def _to_trace(store: Study, path: Path) -> Path:
     """Write every decode of a study as a line of a trace (docs/trace.md)."""
     frame, settings = _episodes(store), {one.label: one.settings for one in store.load().settings}
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
@@ -105,7 +105,7 @@ def _to_trace(store: StudyStore, path: Path) -> Path:
     return path
 
 
-def _decodes(store: StudyStore, episodes: pd.DataFrame, columns: Sequence[str]) -> Iterator[list[dict[str, Any]]]:
+def _decodes(store: Study, episodes: pd.DataFrame, columns: Sequence[str]) -> Iterator[list[dict[str, Any]]]:
     """Yield the decodes of some episodes at a time, with the episode's name in `episode`."""
     for start in range(0, len(episodes), _AT_ONCE):
         some = episodes.iloc[start : start + _AT_ONCE]
@@ -114,7 +114,7 @@ def _decodes(store: StudyStore, episodes: pd.DataFrame, columns: Sequence[str]) 
         yield [{**row, "episode": names[row["episode"]]} for row in rows]
 
 
-def _prompt(store: StudyStore, settings: Mapping[str, Any]) -> int | None:
+def _prompt(store: Study, settings: Mapping[str, Any]) -> int | None:
     """Return the number of prompt tokens of a setting's policy. None if it is not known here."""
     name = settings.get("policy", {}).get("target") or ""
     try:

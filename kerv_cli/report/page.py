@@ -55,20 +55,20 @@ def study_parts(
         priced: The study's speeds on other machines, from `repriced`.
         tables: CSV files of the study, which are linked.
     """
-    store, rows = data.store, data.results
+    study, rows = data.study, data.results
     answer, is_shown = verdict_of(rows, loss)
     more = episodes_to_settle(rows, loss)
-    first, results, figures = rows[0].provenance, str(store.database.results), figures_of(data, loss)
+    first, results, figures = rows[0].provenance, str(study.database.results), figures_of(data, loss)
     return {
-        "name": store.name,
-        "title": data.study.title or store.name,
+        "name": study.name,
+        "title": data.study.title or study.name,
         "note": data.study.note,
         "about": f"{about(rows)} · kerv {first['kerv_version']} at {first['git_commit'][:12]}",
         "question": question(rows, loss),
         "verdict": answer[:1].upper() + answer[1:],
         "is_shown": is_shown,
         "order": order_of(data.by_speed),
-        "settles": store.sweep_command(f"episodes={more}") if more and store.kind == SWEEP else "",
+        "settles": study.sweep_command(f"episodes={more}") if more and study.kind == SWEEP else "",
         "caution": caution(rows),
         "wanted": len(data.study.episodes),
         "missing": len(data.absent),
@@ -88,8 +88,8 @@ def study_parts(
         "assumes": ASSUMES,
         "settings": _settings(data),
         "films": [],
-        "recordings": [(path.stem, _href(path, store.root)) for path in store.recordings],
-        "files": [(path.name, _href(path, store.root)) for path in tables],
+        "recordings": [(path.stem, _href(path, study.root)) for path in study.recordings],
+        "files": [(path.name, _href(path, study.root)) for path in tables],
     }
 
 
@@ -159,7 +159,7 @@ def _films(data: StudyData) -> list[dict[str, Any]]:
     outcomes = data.episodes.set_index(keys)["success"].to_dict()
     films: dict[tuple[str, bool], dict[str, Any]] = {}
     for one in data.study.episodes:
-        path, method = data.store.rollouts / one.recording, one.setting.settings["method"]
+        path, method = data.study.rollouts / one.recording, one.setting.settings["method"]
         success = outcomes.get((one.setting.label, *one.key[1:]))
         if success is None or (method, success) in films or not path.is_file():
             continue

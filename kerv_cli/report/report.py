@@ -11,7 +11,7 @@ import pandas as pd
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.files import write_bytes, write_json, write_text
 from kerv_cli.lab.database import Database
-from kerv_cli.lab.store import ROLLOUT, StudyStore, studies
+from kerv_cli.lab.store import ROLLOUT, Study, studies
 from kerv_cli.report.page import LOSS, figures_of, render
 from kerv_cli.report.plots import about, png
 from kerv_cli.report.profiles import open_profiles
@@ -29,7 +29,7 @@ from kerv_cli.report.tables import (
 )
 
 
-def to_report(database: Database, study: str | None) -> list[StudyStore]:
+def to_report(database: Database, study: str | None) -> list[Study]:
     """Return the studies to report.
 
     Args:
@@ -40,7 +40,7 @@ def to_report(database: Database, study: str | None) -> list[StudyStore]:
         UsageError: No study has an episode.
     """
     if study:
-        return [StudyStore(database, study)]
+        return [Study(database, study)]
     stores = [one for one in studies(database) if one.kind != ROLLOUT and one.counts()[0]]
     if not stores:
         raise UsageError(f"no study in {database.results} has an episode: run `kerv sweep study=demo`")
@@ -118,14 +118,14 @@ def write_study(data: StudyData, loss: float, priced: Sequence[Priced] = (), pub
     """
     if publish:
         check_publishable(data)
-    results, name = data.store.database.results, data.study.name
-    folder, page = results if publish else results / "report", data.store.root / "report.html"
+    results, name = data.study.database.results, data.study.name
+    folder, page = results if publish else results / "report", data.study.root / "report.html"
     tables, document = [], folder / "tables" / f"{name}.json"
     for suffix, table in tables_of(data, priced).items():
         tables.append(folder / "tables" / f"{name}{suffix}.csv")
         write_text(tables[-1], csv_text(table))
     write_json(document, further_of(data))
-    pictures, title = [], data.study.title or data.store.name
+    pictures, title = [], data.study.title or data.study.name
     for suffix, figure in figures_of(data, loss).items():
         pictures.append(folder / "plots" / f"{name}{suffix}.png")
         write_bytes(pictures[-1], png(figure, title, about(data.results)))

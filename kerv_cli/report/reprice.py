@@ -114,7 +114,7 @@ def prices_on(data: StudyData, names: Iterable[str]) -> list[Priced]:
     rows = []
     for name in names:
         with suppress(UsageError):
-            rows += repriced(data, open_profiles(data.store.database.results, [name]))
+            rows += repriced(data, open_profiles(data.study.database.results, [name]))
     return rows
 
 
@@ -129,7 +129,7 @@ def own_profiles(data: StudyData) -> list[str]:
         target = str(policy.get("target")).rstrip("/").rsplit("/", 1)[-1]
         name = f"{target}-{runtime.get('dtype')}"
         with suppress(CheckpointError):
-            profile = read_profile(data.store.database.results / "bench" / f"{name}.json")
+            profile = read_profile(data.study.database.results / "bench" / f"{name}.json")
             if profile.about.get("device_name") in devices:
                 names.append(name)
     return names
@@ -161,7 +161,7 @@ def _work_of_label(data: StudyData, label: str) -> _LabelWork:
             f"setting '{label}' ran {batch} episodes at a time, without times: run it with rollout.batch=1"
         )
     episodes = data.episodes.loc[data.episodes["label"] == label, "episode"]
-    table = data.store.decodes(episodes.tolist(), _COLUMNS).combine_chunks()
+    table = data.study.decodes(episodes.tolist(), _COLUMNS).combine_chunks()
     rounds = table["rounds"].combine_chunks()
     counts = pc.list_value_length(rounds).to_numpy(zero_copy_only=False).astype(np.int64)
     every = rounds.flatten()

@@ -17,8 +17,8 @@ import pyarrow.compute as pc
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, flat, stress_of, without
-from kerv_cli.lab.plan import Episode, Setting, Study, seeds_text
-from kerv_cli.lab.store import StudyStore
+from kerv_cli.lab.plan import Episode, Setting, seeds_text
+from kerv_cli.lab.store import Study
 from kerv_cli.report import statistics as stats
 from kerv_cli.report.decide import with_matched_speed
 from kerv_cli.report.measures import Speeds, compared, measure, paired, speedups
@@ -57,9 +57,8 @@ class StudyData:
     """A study (settings that are compared) with its stored episodes. Each table is computed once.
 
     Attributes:
-        store: The study in the database, to read its decodes.
         study: The settings, and the episodes that the study asks for.
-        episodes: One row per stored episode (label, task, seed and repeat). Columns: those of `StudyStore.frame`, and
+        episodes: One row per stored episode (label, task, seed and repeat). Columns: those of `Study.frame`, and
             difficulty, device, number format and threads.
         runs: One table like `episodes` for each of at least three runs (commands) with the same code on the same
             machine. Each run measured all episodes of the study, or all settings and tasks on seeds of its own. Empty
@@ -67,7 +66,6 @@ class StudyData:
         same_pairs: Whether each run measured all episodes of the study.
     """
 
-    store: StudyStore
     study: Study
     episodes: pd.DataFrame
     runs: tuple[pd.DataFrame, ...] = ()
@@ -149,7 +147,7 @@ class StudyData:
         """How many draft tokens were accepted, for each setting that verified drafts. Reads all decodes."""
         episodes, tallies = self.episodes.groupby("label")["episode"], {}
         for label in self.labels:
-            tally = tally_of(self.store, episodes.get_group(label).tolist())
+            tally = tally_of(self.study, episodes.get_group(label).tolist())
             if tally is not None:
                 tallies[label] = tally
         return tallies
@@ -210,29 +208,29 @@ def _methods_of(setting: Setting) -> str:
     return json.dumps([world, others, dict(setting.identity)], sort_keys=True)
 
 
-def load_study(store: StudyStore, wanted: Sequence[Episode] | None = None) -> StudyData:
+def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyData:
     """Read a study and its stored episodes.
 
     Args:
-        store: The study's files.
+        study: The study, named or loaded.
         wanted: Episodes to read. Settings without any of them are left out. None: read everything.
 
     Raises:
         UsageError: There is no such study, or none of its episodes is stored.
     """
-    study = store.load()
+    study = study.load()
     if wanted is not None:
         labels = {one.setting.label for one in wanted}
         settings = tuple(setting for setting in study.settings if setting.label in labels)
         study = replace(study, settings=settings, episodes=tuple(wanted))
-    frame = store.frame(wanted)
+    frame = study.frame(wanted)
     if frame.empty:
-        raise UsageError(f"study '{store.name}' has no episode yet: {store.how_to_run()}")
-    whole = store.whole_runs() if wanted is None else []
+        raise UsageError(f"study '{study.name}' has no episode yet: {study.how_to_run()}")
+    whole = study.whole_runs() if wanted is None else []
     same_pairs = len(whole) > 2
-    frames = [store.frame(run=run) for run in whole] if same_pairs else _with_new_seeds(frame)
+    frames = [study.frame(run=run) for run in whole] if same_pairs else _with_new_seeds(frame)
     runs = [_labelled(study, run) for run in frames if _same_state(run, frame)]
-    return StudyData(store, study, _labelled(study, frame), tuple(runs) if len(runs) > 2 else (), same_pairs)
+    return StudyData(study, _labelled(study, frame), tuple(runs) if len(runs) > 2 else (), same_pairs)
 
 
 def _same_state(run: pd.DataFrame, episodes: pd.DataFrame) -> bool:
@@ -269,24 +267,24 @@ def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
     return episodes.assign(**added).astype(dict.fromkeys(texts, object))
 
 
-def tally_of(store: StudyStore, episodes: Sequence[int]) -> Tally | None:
+def tally_of(study: Study, episodes: Sequence[int]) -> Tally | None:
     """Count the verifications of some episodes of one setting. None if their decodes verified no draft.
 
     Args:
-        store: The study.
+        study: The study.
         episodes: Row numbers of the episodes.
     """
     total = None
     for first in range(0, len(episodes), _AT_ONCE):
         part = list(episodes[first : first + _AT_ONCE])
-        rounds = store.decodes(part, ("rounds",))["rounds"].combine_chunks().flatten()
+        rounds = study.decodes(part, ("rounds",))["rounds"].combine_chunks().flatten()
         is_verification = pc.and_(pc.greater(rounds.field("tree_size"), 0), pc.not_equal(rounds.field("mode"), "skip"))
         rounds = rounds.filter(is_verification)
         if not len(rounds):
             continue
         start, accepted, nodes = (rounds.field(name).to_numpy() for name in ("start", "accepted", "tree_size"))
         judged = pc.list_value_length(rounds.field("drafted")).to_numpy().astype(np.int64)
-        dofs = len(store.decodes(part[:1], ("actions",))["actions"][0].as_py()[0])
+        dofs = len(study.decodes(part[:1], ("actions",))["actions"][0].as_py()[0])
         tally = Tally.of(start, judged, accepted, nodes, dofs)
         total = tally if total is None else total + tally
     return total
