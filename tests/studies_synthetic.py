@@ -19,10 +19,11 @@ import pytest
 from kerv_cli.base.registry import find
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
+from kerv_cli.episodes.identity import without
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database, opened
 from kerv_cli.lab.events import OnEvent, Outcome
-from kerv_cli.lab.plan import Setting, all_episodes, plain_settings
+from kerv_cli.lab.plan import Setting, all_episodes
 from kerv_cli.lab.runs import Run
 from kerv_cli.lab.store import Study
 from kerv_cli.lab.study import run_blocks
@@ -87,7 +88,7 @@ def study_of(
         Setting(
             label,
             f"method={label.replace(' ', ' threshold.')}",
-            plain_settings(asdict(one)),
+            without(asdict(one), {"task"}),
             IDENTITY,
             name=" ".join(word for word in label.split() if "=" not in word),
         )

@@ -16,10 +16,10 @@ import kerv_cli
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UsageError
 from kerv_cli.episodes import identity
-from kerv_cli.episodes.identity import ENGINE, _meaning, code_hash, hash_of, work_of
+from kerv_cli.episodes.identity import ENGINE, _meaning, code_hash, hash_of, without, work_of
 from kerv_cli.episodes.settings import RolloutSettings
-from kerv_cli.lab.plan import Block, Setting, all_episodes, blocks_of, plain_settings
-from kerv_cli.lab.runs import interrupted_since
+from kerv_cli.lab.plan import Block, Setting, all_episodes, blocks_of
+from kerv_cli.lab.runs import interrupted
 from kerv_cli.lab.store import Study
 from kerv_cli.report.summary import not_in_turn
 from kerv_cli.report.tables import load_study
@@ -35,7 +35,7 @@ on_sqlite = pytest.mark.parametrize("database", ["sqlite"], indirect=True)
 
 
 def work(settings: RolloutSettings, weights: dict[str, str] = IDENTITY) -> str:
-    return Setting("x", "", plain_settings(asdict(settings)), weights).work
+    return Setting("x", "", without(asdict(settings), {"task"}), weights).work
 
 
 def changed(path: str, value: Any) -> RolloutSettings:
@@ -91,7 +91,7 @@ def test_a_setting_that_came_later_leaves_stored_episodes_their_identity():
     """The hashes are of version 1.0.0, which knew neither threshold.over nor rectifier.hold_strict."""
     weights = {"target": "a" * 64}
     for method, stored in KNOWN.items():
-        plain = plain_settings(asdict(compose("rollout", [f"method={method}"], RolloutSettings)))
+        plain = without(asdict(compose("rollout", [f"method={method}"], RolloutSettings)), {"task"})
         assert work_of(plain, weights) == stored, method
         if plain["rectifier"]["kind"] == "compensate":
             other = {**plain, "rectifier": {**plain["rectifier"], "hold_strict": False}}
@@ -264,13 +264,13 @@ def test_an_interrupted_rerun_goes_on(database):
         connection.exec_driver_sql("UPDATE runs SET started = '2020-01-01T00:00:00.000+00:00'")
         connection.exec_driver_sql("UPDATE blocks SET started = '2020-01-01T00:00:00.000+00:00'")
     words = ["sweep", f"study={study.name}"]
-    assert interrupted_since(database, "sweep", study.name, words) == ""
+    assert interrupted(database, "sweep", words) is None
     with pytest.raises(KeyboardInterrupt):
         swept(database.results, study, raising(KeyboardInterrupt(), seeds=[100_002]), rerun="all")
-    since = interrupted_since(database, "sweep", study.name, words)
-    assert since
+    begun = interrupted(database, "sweep", words)
+    assert begun
     rest = {(label, "reach-v3"): ([100_002, 100_003], "rerun=all") for label in study.labels}
-    assert to_run(plan_study(database, study, "all", since)) == rest
+    assert to_run(plan_study(database, study, "all", begun.started)) == rest
 
 
 @on_sqlite
@@ -278,7 +278,7 @@ def test_reasons_name_what_changed(database, monkeypatch):
     swept(database.results, threshold_study(["reach-v3"]))
 
     def reason(settings, task="reach-v3", weights=IDENTITY):
-        setting = Setting("spec_vla r=3", "", plain_settings(asdict(settings)), weights)
+        setting = Setting("spec_vla r=3", "", without(asdict(settings), {"task"}), weights)
         split = Study(database, "threshold", "sweep", (setting,), all_episodes([setting], [task])).plan()
         return next(iter(split.missing.values()), "")
 

@@ -29,7 +29,7 @@ from kerv_cli.catalogue.labels import labels_in, set_labels
 from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.lab.database import EPISODES, SETTINGS, STUDIES, WANTED, Database
 from kerv_cli.lab.plan import ALL, Episode
-from kerv_cli.lab.runs import COMPLETE, RUNNING, RunRow, forget, run_rows, time_left, unfinished
+from kerv_cli.lab.runs import COMPLETE, RUNNING, RunRow, forget, interrupted, run_rows, time_left
 from kerv_cli.lab.store import IMPORT, ROLLOUT, SWEEP, Study
 from kerv_cli.targets.folders import shipped_dir
 
@@ -49,7 +49,7 @@ def artifact_kinds() -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class RunEntry:
-    """One entry of the list that `kerv runs` shows: a study, an artifact, or an unfinished command.
+    """One entry of the list that `kerv runs` shows: a study, an artifact, or an interrupted command.
 
     Attributes:
         id: Name in commands.
@@ -299,7 +299,7 @@ def _description(folder: Path, kind: str) -> Path:
 
 def _artifacts(folder: Path, kind: str) -> Iterator[RunEntry]:
     for path in visible(folder):
-        # an unfinished recording and a training before its first validation have no description yet
+        # an interrupted recording and a training before its first validation have no description yet
         if any(file.is_file() for file in (_description(path, kind), path / "recording.json", path / LOG)):
             yield _artifact(path, kind)
 
@@ -446,7 +446,7 @@ def plan_of(run: RunEntry, database: Database) -> Study:
     episodes = tuple(Episode(new[one.setting.label], one.task, one.seed, one.repeat) for one in study.episodes)
     study = dataclasses.replace(study, settings=tuple(new.values()), episodes=episodes)
     command = again_words(run, results)
-    row = unfinished(database, study.kind, command)
+    row = interrupted(database, study.kind, command)
     if row is not None:
         name = row.name
     elif study.kind == ROLLOUT:

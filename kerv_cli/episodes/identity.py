@@ -79,9 +79,10 @@ def work_of(settings: Plain, identity: Identity, engine: int = ENGINE) -> str:
 
 @functools.lru_cache(maxsize=4096)
 def _work(settings: str, identity: str, policy: str, engine: int) -> str:
-    hashes = {f"{name}_sha256": value for name, value in json.loads(identity).items() if name != OBSERVATION}
-    plain = json.loads(settings)
-    return hash_of({"settings": effective(plain), "policy": {"kind": policy, **hashes}, "engine": engine})
+    determining = {"kind": policy}
+    for name, value in without(json.loads(identity), {OBSERVATION}).items():
+        determining[f"{name}_sha256"] = value
+    return hash_of({"settings": effective(json.loads(settings)), "policy": determining, "engine": engine})
 
 
 def effective(settings: Plain) -> dict[str, Any]:
@@ -120,7 +121,7 @@ def depends_on_order(settings: Plain) -> bool:
     This is so if a skip rule adapts its similarity threshold after each episode (`skip.up`, `skip.down`).
     """
     skip = settings["skip"]
-    return any(skip.get(name) for name in ("up", "down"))
+    return bool(skip.get("up") or skip.get("down"))
 
 
 def stress_of(settings: Plain) -> dict[str, Any]:
@@ -171,20 +172,21 @@ def without_effect(settings: RolloutSettings, overrides: Iterable[str], sweep: b
         return {}
     idle = idle_keys(settings)
     if not sweep:
-        idle |= {f"runtime.{name}": "a rollout runs in one process" for name in sorted(NOT_DETERMINING_RUNTIME)}
-    reasons = {}
+        for name in NOT_DETERMINING_RUNTIME:
+            idle[f"runtime.{name}"] = "a rollout runs in one process"
+    reasons: dict[str, str] = {}
     for override in overrides:
         key = override.partition("=")[0].lstrip("+")
-        reason = next((why for name, why in idle.items() if key == name or key.startswith(f"{name}.")), None)
-        if reason is not None:
-            reasons[override] = reason
+        for name, reason in idle.items():
+            if f"{key}.".startswith(f"{name}."):
+                reasons.setdefault(override, reason)
     return reasons
 
 
 def _idle_timing(timing: TimingSettings) -> dict[str, str]:
     if timing.clock == WAITS:
-        names = ("latency", "latency_ms", "profile", "ar_ms", "delay_compensation")
-        return {f"rollout.{name}": "rollout.clock=waits: the world waits for every decode" for name in names}
+        names = "latency", "latency_ms", "profile", "ar_ms", "delay_compensation"
+        return dict.fromkeys(map("rollout.{}".format, names), "rollout.clock=waits: the world waits for every decode")
     idle = {}
     if timing.latency != CONSTANT:
         idle["rollout.latency_ms"] = f"rollout.latency={timing.latency}"
@@ -208,7 +210,7 @@ def idle_keys(settings: RolloutSettings) -> dict[str, str]:
     elif not acceptance.reads_threshold:
         idle["threshold"] = f"acceptance={acceptance.name} has no threshold"
     for kind, part in method.parts.items():
-        idle |= {f"{kind}.{name}": reason for name, reason in part.idle(method.settings[kind]).items()}
+        idle |= flat({kind: part.idle(method.settings[kind])})
     needed, artifacts = set(method.needs), ArtifactPart.every()
     if not any(artifacts[kind].names_more for kind in needed):
         for kind in artifacts.keys() - needed:
@@ -236,9 +238,8 @@ def code_hash() -> str:
     Episodes are stored with this hash, so that those computed by other code can be found. It covers the syntax trees of
     kerv's own files and of registered plugins. Comments, docstrings and formatting do not change it.
     """
-    root, digest = Path(kerv_cli.__file__).parent, hashlib.sha256()
-    own = sorted(path for room in _COMPUTING for path in (root / room).rglob("*.py"))
-    for name, path in [*((path.relative_to(root).as_posix(), path) for path in own), *_of_plugins()]:
+    digest = hashlib.sha256()
+    for name, path in sorted(_computing_files()):
         content = _meaning(path.read_bytes()) if path.suffix == ".py" else path.read_bytes()
         digest.update(f"{name}\0".encode() + hashlib.sha256(content).digest())
     return digest.hexdigest()
@@ -255,11 +256,14 @@ def _meaning(source: bytes) -> bytes:
 def _plain(node: object) -> object:
     """Return a syntax tree as lists and strings. Empty fields are left out: newer versions of Python have more."""
     if isinstance(node, list):
-        return [_plain(one) for one in node]
+        return list(map(_plain, node))
     if not isinstance(node, ast.AST):
         return ascii(node)
-    given = [(name, value) for name, value in ast.iter_fields(node) if value is not None and value != []]
-    return [type(node).__name__, *((name, _plain(value)) for name, value in given)]
+    plain: list[object] = [type(node).__name__]
+    for name, value in ast.iter_fields(node):
+        if value not in (None, []):
+            plain.append((name, _plain(value)))
+    return plain
 
 
 class _Essential(ast.NodeTransformer):
@@ -270,17 +274,26 @@ class _Essential(ast.NodeTransformer):
         return None if alone else self.generic_visit(node)  # type: ignore[return-value]
 
     def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.AST:
-        node.values = [one for one in node.values if not (isinstance(one, ast.Constant) and one.value == "")]
+        node.values = list(filter(_is_not_empty, node.values))
         return self.generic_visit(node)
 
 
-def _of_plugins() -> Iterator[tuple[str, Path]]:
+def _is_not_empty(node: ast.expr) -> bool:
+    return not (isinstance(node, ast.Constant) and node.value == "")
+
+
+def _computing_files() -> Iterator[tuple[str, Path]]:
+    """Yield the name and path of kerv's own files that run during an episode, and of registered plugins."""
+    root = Path(kerv_cli.__file__).parent
+    for room in _COMPUTING:
+        for path in (root / room).rglob("*.py"):
+            yield path.relative_to(root).as_posix(), path
     modules: set[str] = set()
     for kind in set(registry.kinds()) - {"command"}:
         for part in registry.parts(kind).values():
             if not part.absent and not part.module.startswith("kerv_cli."):
                 modules |= {part.module, part.code().__module__} if isinstance(part, ArtifactPart) else {part.module}
-    for name in sorted(modules):
+    for name in modules:
         spec = importlib.util.find_spec(name)
         if spec is not None and spec.origin is not None:
             yield name, Path(spec.origin)

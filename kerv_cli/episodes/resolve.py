@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from itertools import chain
 from pathlib import Path
 
 from kerv_cli.base.config import compose, expand, preset_file, split, swept_keys
@@ -44,13 +45,13 @@ class Point:
             overrides: The point's overrides, `key=value`.
             varied: Keys that differ within the grid.
         """
-        pairs = (override.lstrip("+").split("=", 1) for override in overrides)
+        pairs = [override.lstrip("+").split("=", 1) for override in overrides]
         return cls(name, tuple(overrides), {key: value for key, value in pairs if key in varied})
 
     @property
     def label(self) -> str:
         """The grid's name and the point's values, such as `spec_vla r=3`."""
-        values = (f"{key.rpartition('.')[2]}={value}" for key, value in self.varies.items())
+        values = [f"{key.rpartition('.')[2]}={value}" for key, value in self.varies.items()]
         return check_label(" ".join([self.name, *values]))
 
 
@@ -93,22 +94,21 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     of_sweep = [o for o in overrides if _key(o).split(".")[0] in SweepSettings.__dataclass_fields__]
     of_settings = [o for o in overrides if o not in of_sweep or o.startswith("results=")]
     sweep = compose("sweep", of_sweep, SweepSettings)
-    study = sweep.study
-    file = next((o.partition("=")[2] for o in of_sweep if _key(o) == "study"), SweepSettings.groups["study"])
-    path = preset_file("study", file)
-    study.name = study.name or path.stem
-    typed = {_key(o) for o in of_settings}
+    files = dict(override.split("=", 1) for override in of_sweep)
+    study, path = sweep.study, preset_file("study", files.get("study", SweepSettings.groups["study"]))
+    study.name, typed = study.name or path.stem, set(map(_key, of_settings))
     with _line_of(path, typed, "common"):
         common = _outranked(split(study.common), of_settings)
     points = _points(study, path)
     _check_points(study, points, typed)
     settings: dict[str, RolloutSettings] = {}
     for label, point in points.items():
-        with _line_of(path, typed, f"settings.{point.name}", {_key(o): "common" for o in common}):
+        with _line_of(path, typed, f"settings.{point.name}", dict.fromkeys(map(_key, common), "common")):
             settings[label] = compose("rollout", _outranked(common, point.overrides), RolloutSettings)
     if study.axis and not any(study.axis in flat(asdict(setting)) for setting in settings.values()):
+        varies = chain.from_iterable(point.varies for point in points.values())
         with _line_of(path, (), "axis"):
-            raise UnknownName("axis", study.axis, dict.fromkeys(key for one in points.values() for key in one.varies))
+            raise UnknownName("axis", study.axis, dict.fromkeys(varies))
     narrows = any(key.startswith("policy") for key in typed) and "task" not in typed
     _settle(settings.values(), settings[study.baseline], narrows)
     return ResolvedStudy(sweep, settings, points, tuple(of_settings))
@@ -121,8 +121,9 @@ def _points(study: StudySettings, path: Path) -> dict[str, Point]:
         with _line_of(path, (), f"settings.{name}"):
             overrides = split(text)
             varied = swept_keys(overrides)
-            found = [Point.of(name, point, varied) for point in expand(overrides)]
-            points |= {point.label: point for point in found}
+            for words in expand(overrides):
+                point = Point.of(name, words, varied)
+                points[point.label] = point
     return points
 
 
@@ -130,9 +131,9 @@ def _check_points(study: StudySettings, points: Mapping[str, Point], typed: Coll
     """Refuse a study without settings or without its baseline, or one that sets keys of the command line (`typed`)."""
     if not points:
         raise UsageError(f"study '{study.name}' has no settings: see conf/study/demo.yaml for some")
-    varied = {_key(override) for point in points.values() for override in point.overrides} & set(typed)
-    if varied:
-        raise UsageError(f"study '{study.name}' sets {', '.join(sorted(varied))} itself: leave it out")
+    own = chain.from_iterable(point.overrides for point in points.values())
+    if twice := set(map(_key, own)).intersection(typed):
+        raise UsageError(f"study '{study.name}' sets {', '.join(sorted(twice))} itself: leave it out")
     if study.baseline not in points:
         raise UsageError(
             f"study '{study.name}' has no setting '{study.baseline}', the baseline that its others are "
@@ -183,18 +184,17 @@ def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
     Raises:
         UsageError: A key or name is unknown, a value is impossible, or `results` has several values.
     """
-    tasks = [override for override in overrides if override.startswith("task=")]
-    others = [override for override in overrides if override not in tasks]
+    tasks, others = _parted(overrides, {"task"})
     swept = swept_keys(others) if multirun else []
-    varied = [key for key in swept if key != "method"]
+    varied = set(swept) - {"method"}
     if "results" in varied:
         raise UsageError("results= cannot have several values: a rollout has one results folder")
     settings: dict[str, RolloutSettings] = {}
     points: dict[str, Point] = {}
     for words in expand(others) if multirun else [others]:
-        with _named(" ".join(word for word in words if _key(word) in swept)):
+        with _named(" ".join(_parted(words, swept)[0])):
             composed = compose("rollout", [*tasks, *words], RolloutSettings)
-        parts = [word for word in words if _key(word) in METHOD_KINDS and _key(word) not in varied]
+        parts, _ = _parted(words, set(METHOD_KINDS) - varied)
         point = Point.of(" ".join([composed.method, *parts]), words, varied)
         settings[point.label], points[point.label] = composed, point
     baseline = next((label for label, one in settings.items() if _is_ar(one)), next(iter(settings)))
@@ -221,8 +221,8 @@ def _settle(settings: Iterable[RolloutSettings], baseline: RolloutSettings, narr
 
 
 def _is_ar(settings: RolloutSettings) -> bool:
-    drafts = (settings.prefill_draft, settings.proposer, settings.skip)
-    return all(part.kind == "none" for part in drafts) and settings.method == "ar"
+    drafts = {settings.prefill_draft.kind, settings.proposer.kind, settings.skip.kind}
+    return drafts == {"none"} and settings.method == "ar"
 
 
 def idle_overrides(resolved: ResolvedStudy, sweep: bool = True) -> dict[str, str]:
@@ -236,12 +236,14 @@ def idle_overrides(resolved: ResolvedStudy, sweep: bool = True) -> dict[str, str
         sweep: Whether it is a study, whose episodes may run in several processes.
     """
     reasons: dict[str, str] = {}
+    in_each = []
     for label, settings in resolved.settings.items():
-        idle = without_effect(settings, resolved.points[label].overrides, sweep)
         name = f"{label}: " if len(resolved.settings) > 1 else ""
-        reasons |= {f"{name}{word}": why for word, why in idle.items()}
-    common = [without_effect(settings, resolved.common, sweep) for settings in resolved.settings.values()]
-    return reasons | {word: why for word, why in common[0].items() if all(word in idle for idle in common)}
+        for word, why in without_effect(settings, resolved.points[label].overrides, sweep).items():
+            reasons[f"{name}{word}"] = why
+        in_each.append(without_effect(settings, resolved.common, sweep))
+    everywhere = set(in_each[0]).intersection(*in_each)
+    return reasons | {word: why for word, why in in_each[0].items() if word in everywhere}
 
 
 def study_name(study: str) -> str:
@@ -261,9 +263,18 @@ def study_name(study: str) -> str:
 
 def _outranked(overrides: Iterable[str], by: Sequence[str]) -> list[str]:
     """Combine two lists of overrides. For keys in both lists, `by` wins."""
-    keys = {_key(override) for override in by}
-    return [*(override for override in overrides if _key(override) not in keys), *by]
+    _, others = _parted(overrides, set(map(_key, by)))
+    return [*others, *by]
+
+
+def _parted(overrides: Iterable[str], keys: Collection[str]) -> tuple[list[str], list[str]]:
+    """Return the overrides whose key is one of `keys`, and the others."""
+    named: list[str] = []
+    others: list[str] = []
+    for override in overrides:
+        (named if _key(override) in keys else others).append(override)
+    return named, others
 
 
 def _key(override: str) -> str:
-    return override.split("=", 1)[0]
+    return override.partition("=")[0]

@@ -6,7 +6,7 @@ import io
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from typing import Any
 
 import numpy as np
@@ -40,22 +40,23 @@ def _phase(phase: str) -> Callable[[DecodeRecord], float | None]:
     return lambda decode: decode.phases.get(phase)
 
 
-def _attributes(*names: str, kind: pa.DataType = INT) -> Fields:
-    return {name: (kind, attrgetter(name)) for name in names}
+def _columns(*names: str, kind: pa.DataType = INT, read: Callable[[str], Any] = attrgetter, as_: str = "{}") -> Fields:
+    """Return columns of one type. `read` gets a name, and returns the function that reads its value from a record."""
+    return {as_.format(name): (kind, read(name)) for name in names}
 
 
-def _looks_up(proposer: str) -> bool:
-    part = ProposerPart.every().get(proposer)
+def _looks_up(one: Round) -> bool:
+    part = ProposerPart.every().get(one.proposer)
     return part is not None and part.looks_up
 
 
 _EPISODE: Fields = {
-    **_attributes("success", kind=FLAG),
-    **_attributes("steps"),  # control steps executed
+    **_columns("success", kind=FLAG),
+    **_columns("steps"),  # control steps executed
     "decodes": (INT, lambda episode: len(episode.decodes)),
-    **_attributes("seconds", kind=FLOAT),  # inference time
-    **{f"seconds.{phase}": (FLOAT, _summed(_phase(phase))) for phase in PHASES},
-    **_attributes("forwards"),
+    **_columns("seconds", kind=FLOAT),  # inference time
+    **_columns(*PHASES, kind=FLOAT, read=lambda phase: _summed(_phase(phase)), as_="seconds.{}"),
+    **_columns("forwards"),
     "verifications": (INT, _judged(lambda one: 1)),
     "tokens": (INT, _summed(lambda decode: len(decode.tokens))),  # committed in all rounds
     "committed": (INT, _judged(lambda one: one.committed)),  # in verifications, bonus included
@@ -67,58 +68,59 @@ _EPISODE: Fields = {
     "skipped_decodes": (INT, _summed(lambda decode: decode.skipped)),
     "unverified_tokens": (INT, _summed(lambda decode: decode.unverified)),  # executed but not verified by the target
     "executed_tokens": (INT, _summed(lambda decode: int(decode.actions.size))),  # control steps × DoFs returned
-    "retrieval_decodes": (INT, _summed(lambda decode: any(_looks_up(r.proposer) for r in decode.rounds))),
+    "retrieval_decodes": (INT, _summed(lambda decode: any(map(_looks_up, decode.rounds)))),
     "deviation_sum": (FLOAT, _summed(lambda decode: decode.deviation)),  # normalised action units, over sampled decodes
     "deviation_count": (INT, _summed(lambda decode: decode.deviation is not None)),
     "delay_decodes": (INT, _summed(lambda decode: decode.delay is not None)),  # during which the world went on
     "delay_seconds": (FLOAT, _summed(_delay("seconds"))),  # sum over these decodes of the latency
     "delay_steps": (INT, _summed(_delay("steps"))),  # the sum in control steps
     # of these: steps on the previous chunk, steps on the last action, and actions that were too old to execute
-    **{f"{name}_steps": (INT, _summed(_delay(name))) for name in ("carried", "held", "dropped")},
-    **_attributes("path_length", "jerk", kind=FLOAT),  # of the end effector: metres; m/s³
-    **_attributes("closest_approach", kind=FLOAT),  # least distance of fingertips to object, metres
-    **_attributes("object_moved", kind=FLOAT),  # how far the object moved after they came within 5 cm, metres
-    **_attributes("wall_seconds", kind=FLOAT),
+    **_columns("carried", "held", "dropped", read=lambda name: _summed(_delay(name)), as_="{}_steps"),
+    **_columns("path_length", "jerk", kind=FLOAT),  # of the end effector: metres; m/s³
+    **_columns("closest_approach", kind=FLOAT),  # least distance of fingertips to object, metres
+    **_columns("object_moved", kind=FLOAT),  # how far the object moved after they came within 5 cm, metres
+    **_columns("wall_seconds", kind=FLOAT),
     "initial_state": (pa.list_(FLOAT), lambda episode: np.asarray(episode.initial_state, np.float64).ravel().tolist()),
 }
-EPISODE_SCHEMA = pa.schema((name, kind) for name, (kind, _) in _EPISODE.items())
+
+
+def _schema(columns: Fields) -> pa.Schema:
+    return pa.schema((name, kind) for name, (kind, _) in columns.items())
+
+
+def _row(columns: Fields, record: object) -> dict[str, Any]:
+    return {name: read(record) for name, (_, read) in columns.items()}
+
+
+EPISODE_SCHEMA = _schema(_EPISODE)
 """Columns that are computed from an episode's record. The database adds others, such as the task and the time."""
 
 _TOKENS = pa.list_(pa.int32())
-_COUNTS = ("start", "accepted", "committed", "tree_size", "levels")
-_ROUND = pa.struct(
-    [
-        (field.name, TEXT if field.name in ("mode", "proposer") else pa.int32() if field.name in _COUNTS else _TOKENS)
-        for field in fields(Round)
-    ]
-)
-
-
-_DELAYED = ("observed", "carried", "held", "dropped")
+_OF_ROUND = {"str": TEXT, "int": pa.int32(), "tuple[int, ...]": _TOKENS}
+_ROUND = pa.struct([(field.name, _OF_ROUND[str(field.type)]) for field in fields(Round)])
 _DECODE: Fields = {
-    **_attributes("mode", kind=TEXT),
-    **_attributes("forwards"),
-    **_attributes("seconds", kind=FLOAT),
-    **{f"seconds.{phase}": (FLOAT, _phase(phase)) for phase in PHASES},
+    **_columns("mode", kind=TEXT),
+    **_columns("forwards"),
+    **_columns("seconds", kind=FLOAT),
+    **_columns(*PHASES, kind=FLOAT, read=_phase, as_="seconds.{}"),
     "tokens": (_TOKENS, lambda decode: list(decode.tokens)),
     "actions": (pa.list_(pa.list_(pa.float32())), lambda decode: np.asarray(decode.actions, np.float32).tolist()),
-    "rounds": (pa.list_(_ROUND), lambda decode: [vars(one) for one in decode.rounds]),
-    **_attributes("compensated"),
-    **_attributes("skipped", kind=FLAG),
-    **_attributes("variability", "similarity", "metric", "deviation", kind=FLOAT),
-    **_attributes("reason", kind=TEXT),  # given by a skip rule: trusted, streak; null if none
+    "rounds": (pa.list_(_ROUND), lambda decode: list(map(vars, decode.rounds))),
+    **_columns("compensated"),
+    **_columns("skipped", kind=FLAG),
+    **_columns("variability", "similarity", "metric", "deviation", kind=FLOAT),
+    **_columns("reason", kind=TEXT),  # given by a skip rule: trusted, streak; null if none
     "delay_seconds": (FLOAT, _delay("seconds")),  # this and the next: null if the world waited
     "delay_steps": (INT, _delay("steps")),
-    **{name: (INT, _delay(name)) for name in _DELAYED},
+    **_columns("observed", "carried", "held", "dropped", read=_delay),
 }
 # index: position of the decode in its episode; step: control step at which its actions begin
-_POSITION = {"index": INT, "step": INT}
-DECODE_SCHEMA = pa.schema({**_POSITION, **{name: kind for name, (kind, _) in _DECODE.items()}}.items())
+DECODE_SCHEMA = pa.schema([("index", INT), ("step", INT), *_schema(_DECODE)])
 
 
 def episode_row(record: EpisodeRecord) -> dict[str, Any]:
     """Return the columns of one episode as values that JSON can store. NaN becomes None, in a list infinity, too."""
-    return {name: _plain(value(record)) for name, (_, value) in _EPISODE.items()}
+    return {name: _plain(value) for name, value in _row(_EPISODE, record).items()}
 
 
 def _plain(value: Any) -> Any:
@@ -130,10 +132,9 @@ def _plain(value: Any) -> Any:
 
 def decodes_table(record: EpisodeRecord) -> pa.Table:
     """Return the decodes of one episode as a table with the columns of DECODE_SCHEMA, one row per decode."""
-    rows = [
-        {"index": index, "step": step, **{name: value(decode) for name, (_, value) in _DECODE.items()}}
-        for index, (decode, step) in enumerate(zip(record.decodes, record.decode_steps, strict=True))
-    ]
+    rows = []
+    for index, (decode, step) in enumerate(zip(record.decodes, record.decode_steps, strict=True)):
+        rows.append({"index": index, "step": step, **_row(_DECODE, decode)})
     return pa.Table.from_pylist(rows, schema=DECODE_SCHEMA)
 
 
@@ -162,29 +163,35 @@ _SAME = (
 
 def decode_records(table: pa.Table) -> list[DecodeRecord]:
     """Return the decodes in a table that `decodes_table` made."""
-    return [_decode_record(row) for row in table.to_pylist()]
+    return list(map(_decode_record, table.to_pylist()))
 
 
 def _round(values: dict[str, Any]) -> Round:
-    # episodes from before a field existed have None there
-    known = {name: v for name, v in values.items() if v is not None}
-    plain: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in known.items()}
+    plain: dict[str, Any] = {}
+    for name, value in values.items():
+        if value is not None:  # episodes from before a field existed have None there
+            plain[name] = tuple(value) if isinstance(value, list) else value
     return Round(**plain)
 
 
 def _decode_record(row: dict[str, Any]) -> DecodeRecord:
-    rounds = tuple(_round(one) for one in row["rounds"])
-    verified = {index for one in rounds for index in range(one.start, one.start + one.committed)}
-    late = None if row["delay_steps"] is None else [row[name] for name in ("delay_seconds", "delay_steps", *_DELAYED)]
+    rounds, tokens = tuple(map(_round, row["rounds"])), tuple(row["tokens"])
+    filled = set(range(len(tokens) if row["compensated"] else 0))  # a rectifier filled what no round committed
+    for one in rounds:
+        filled.difference_update(range(one.start, one.start + one.committed))
+    phases = {}
+    for phase in PHASES:
+        if row[f"seconds.{phase}"] is not None:
+            phases[phase] = row[f"seconds.{phase}"]
+    late = itemgetter("delay_seconds", "delay_steps", "observed", "carried", "held", "dropped")
     return DecodeRecord(
-        tokens=tuple(row["tokens"]),
+        tokens=tokens,
         actions=np.asarray(row["actions"], np.float32),
         rounds=rounds,
-        phases={phase: row[f"seconds.{phase}"] for phase in PHASES if row[f"seconds.{phase}"] is not None},
-        # a rectifier filled what no round committed
-        filled=tuple(i for i in range(len(row["tokens"])) if i not in verified) if row["compensated"] else (),
-        delay=None if late is None else Delay(*late),
-        **{name: row[name] for name in _SAME},
+        phases=phases,
+        filled=tuple(sorted(filled)),
+        delay=None if row["delay_steps"] is None else Delay(*late(row)),
+        **dict(zip(_SAME, itemgetter(*_SAME)(row), strict=True)),
     )
 
 

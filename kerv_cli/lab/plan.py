@@ -12,6 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any, TypeVar
 
 from kerv_cli.base.durations import count
@@ -25,7 +26,6 @@ from kerv_cli.episodes.identity import (
     depends_on_order,
     effective,
     flat,
-    without,
     work_of,
 )
 
@@ -121,16 +121,16 @@ def all_episodes(
         UsageError: There are more than MOST_EPISODES.
     """
     tasks = list(dict.fromkeys(tasks))
-    total = len(tasks) * repeats * sum(setting.settings["episodes"] for setting in settings)
+    numbers = [setting.settings["episodes"] for setting in settings]
+    total = len(tasks) * repeats * sum(numbers)
     if total > MOST_EPISODES:
         raise UsageError(f"the study has {total} episodes: at most {MOST_EPISODES} are allowed")
-    longest = max((setting.settings["episodes"] for setting in settings), default=0)
     episodes: list[Episode] = []
-    for repeat, task, first in itertools.product(range(repeats), tasks, range(0, longest, block)):
-        for setting in settings:
-            start, number = setting.settings["seed"], setting.settings["episodes"]
+    for repeat, task, first in itertools.product(range(repeats), tasks, range(0, max(numbers, default=0), block)):
+        for setting, number in zip(settings, numbers, strict=True):
+            start = setting.settings["seed"]
             seeds = range(start, start + number)[first : first + block]
-            episodes.extend(Episode(setting, task, seed, repeat) for seed in seeds)
+            episodes += [Episode(setting, task, seed, repeat) for seed in seeds]
     return tuple(episodes)
 
 
@@ -217,8 +217,7 @@ class Block:
         if self.episodes and self.batch > 1:
             yield from self.episodes
             return
-        for seed in self.seeds:
-            turn = [one for one in self.episodes if one.seed == seed]
+        for seed, turn in sorted(grouped(self.episodes, attrgetter("seed")).items()):
             digest = hashlib.sha256(f"{self.task} {seed} {turn[0].repeat}".encode()).digest()
             for index in np.random.default_rng(list(digest)).permutation(len(turn)):
                 yield turn[int(index)]
@@ -276,7 +275,7 @@ def _rows_of_turn(
     """Choose a stored row for each episode that has some: of the block that ran most of the turn, then the newest."""
     in_block: Counter[str] = Counter()
     for one in turn:
-        in_block.update(row.block for row in usable[one])
+        in_block.update(map(attrgetter("block"), usable[one]))
     found = {}
     for one in turn:
         if usable[one]:
@@ -292,7 +291,10 @@ def _reasons(
     earlier: Mapping[str, tuple[Setting, str]],
 ) -> dict[Episode, str]:
     """Return the missing episodes, each with the reason for running it. `split` explains the arguments."""
-    works, tasks = {key[0] for key in stored}, {key[:2] for key in stored}
+    works, tasks = set(), set()
+    for work, task, *_ in stored:
+        works.add(work)
+        tasks.add((work, task))
     of_rows = {TIMED: "times wanted in turn", CHANGED: "other code", ALL: "rerun=all"}.get(rerun, "order of episodes")
 
     @functools.cache
@@ -312,7 +314,8 @@ def _reasons(
     return reasons
 
 
-def _grouped(episodes: Iterable[Episode], key: Callable[[Episode], K]) -> dict[K, list[Episode]]:
+def grouped(episodes: Iterable[Episode], key: Callable[[Episode], K]) -> dict[K, list[Episode]]:
+    """Return the episodes in groups of equal keys."""
     groups: dict[K, list[Episode]] = {}
     for one in episodes:
         groups.setdefault(key(one), []).append(one)
@@ -321,7 +324,7 @@ def _grouped(episodes: Iterable[Episode], key: Callable[[Episode], K]) -> dict[K
 
 def _turns(episodes: Iterable[Episode]) -> dict[tuple[str, int, int], list[Episode]]:
     """Group episodes by task, seed and repeat. In such a group, the settings take turns."""
-    return _grouped(episodes, lambda one: (one.task, one.seed, one.repeat))
+    return grouped(episodes, lambda one: (one.task, one.seed, one.repeat))
 
 
 def _ordered_parts(episodes: Iterable[Episode], block: int) -> list[list[Episode]]:
@@ -334,7 +337,7 @@ def _ordered_parts(episodes: Iterable[Episode], block: int) -> list[list[Episode
     def key(one: Episode) -> tuple[str, str, int, int]:
         return one.setting.work, one.task, one.repeat, (one.seed - one.setting.settings["seed"]) // block
 
-    return list(_grouped((one for one in episodes if one.setting.depends_on_order), key).values())
+    return list(grouped(filter(attrgetter("setting.depends_on_order"), episodes), key).values())
 
 
 def _keep_whole_orders(usable: dict[Episode, list[StoredEpisode]], block: int) -> None:
@@ -347,16 +350,17 @@ def _keep_whole_orders(usable: dict[Episode, list[StoredEpisode]], block: int) -
         usable: The stored rows of each episode. The lists are replaced.
         block: Number of seeds that the study keeps together.
     """
-    sizes = Counter(row.block for row in itertools.chain(*usable.values()))
+    sizes = Counter(map(attrgetter("block"), itertools.chain(*usable.values())))
     for part in _ordered_parts(usable, block):
-        seeds = seeds_text(one.seed for one in part)
-        whole = [row for row in usable[part[0]] if row.seeds == seeds]
-        for one in part:
-            blocks = {row.block for row in usable[one]}
-            whole = [row for row in whole if row.block in blocks]
-        best = max(whole, key=lambda row: (sizes[row.block], row.started, row.id), default=None)
-        for one in part:
-            usable[one] = [row for row in usable[one] if best is not None and row.block == best.block]
+        seeds = seeds_text(map(attrgetter("seed"), part))
+        by_block: dict[str, list[StoredEpisode]] = {}
+        for row in itertools.chain(*map(usable.__getitem__, part)):
+            if row.seeds == seeds:
+                by_block.setdefault(row.block, []).append(row)
+        whole = [rows for rows in by_block.values() if len(rows) == len(part)]
+        best = max(whole, key=lambda rows: (sizes[rows[0].block], rows[0].started, rows[0].id), default=[])
+        for one, row in itertools.zip_longest(part, best):
+            usable[one] = [row] if row else []
 
 
 def blocks_of(episodes: Iterable[Episode], block: int, workers: int = 1) -> list[Block]:
@@ -372,16 +376,16 @@ def blocks_of(episodes: Iterable[Episode], block: int, workers: int = 1) -> list
         block: Number of seeds that the study keeps together.
         workers: Number of processes.
     """
-    by_way = _grouped(episodes, lambda one: batch_of(one.setting.settings) > 1)
+    by_way = grouped(episodes, lambda one: batch_of(one.setting.settings) > 1)
     groups: dict[tuple[object, ...], list[Episode]] = {}
     for (task, seed, repeat), turn in _turns(by_way.get(False, ())).items():
-        for threads, part in _grouped(turn, lambda one: one.setting.settings["runtime"]["threads"]).items():
+        for threads, part in grouped(turn, lambda one: one.setting.settings["runtime"]["threads"]).items():
             index = (seed - min(one.setting.settings["seed"] for one in part)) // block
-            ordered = [one for one in part if one.setting.depends_on_order]
-            same = sorted(one.setting.work for one in ordered or part)
+            ordered = list(filter(attrgetter("setting.depends_on_order"), part))
+            same = sorted(map(attrgetter("setting.work"), ordered or part))
             groups.setdefault((task, repeat, threads, index, *same), []).extend(part)
-    blocks = [Block(tuple(group)) for group in groups.values()]
-    for group in _grouped(by_way.get(True, ()), lambda one: (one.setting.work, one.repeat)).values():
+    blocks = list(map(Block, map(tuple, groups.values())))
+    for group in grouped(by_way.get(True, ()), lambda one: (one.setting.work, one.repeat)).values():
         size = min(FULL_BATCHES * batch_of(group[0].setting.settings), -(-len(group) // workers))
         blocks += [Block(tuple(group[first : first + size])) for first in range(0, len(group), size)]
     return blocks
@@ -406,18 +410,13 @@ def differences(new: Setting, old: Setting | None = None, work: str = "") -> str
         elif kind != OBSERVATION:
             changes.append(f"{kind} changed")
     before, after = flat(effective(old.settings)), flat(effective(new.settings))
-    changes += (f"{key} {before.get(key)} → {after.get(key)}" for key in _differing(after, before))
+    changes += [f"{key} {before.get(key)} → {after.get(key)}" for key in _differing(after, before)]
     return ", ".join(changes[:3]) or "new setting"
 
 
 def _differing(new: Mapping[str, Any], old: Mapping[str, Any]) -> list[str]:
     """Return the keys that have different values in two mappings. A missing key has the value None."""
     return [key for key in dict.fromkeys([*new, *old]) if new.get(key) != old.get(key)]
-
-
-def plain_settings(settings: Plain) -> dict[str, Any]:
-    """Return a rollout's settings without the task, as a Setting holds them."""
-    return without(settings, {"task"})
 
 
 def seeds_text(seeds: Iterable[int]) -> str:

@@ -92,7 +92,7 @@ def run_rows(database: Database, kind: str | None = None, name: str | None = Non
     query = query if kind is None else query.where(RUNS.c.kind == kind)
     query = query if name is None else query.where(RUNS.c.name == name)
     with database.reading() as connection:
-        return [_row_of(row) for row in connection.execute(query)]
+        return list(map(_row_of, connection.execute(query)))
 
 
 def time_left(row: RunRow) -> str:
@@ -119,12 +119,11 @@ def time_of(database: Database, kind: str, command: Sequence[str], units: int = 
     """
     rows = run_rows(database, kind)
     first, wanted = {row.name: row.id for row in rows}, _options(command)
-    similar = [
-        row
-        for row in rows
-        if row.status == COMPLETE and row.host == socket.gethostname() and first[row.name] == row.id and row.finished
-        if (row.total or not units) and _options(row.command) == wanted
-    ]
+    similar = []
+    for row in rows:
+        is_whole = row.status == COMPLETE and row.finished and first[row.name] == row.id and (row.total or not units)
+        if is_whole and row.host == socket.gethostname() and _options(row.command) == wanted:
+            similar.append(row)
     if not similar:
         return "time unknown, nothing like it has run on this machine"
     row = min(similar, key=lambda row: abs(math.log(units / row.total))) if units else similar[0]
@@ -159,7 +158,7 @@ def pulse(database: Database) -> tuple[str, bool]:
     newest = sa.select(sa.func.max(EPISODES.c.id)).scalar_subquery()
     facts = sa.select(sa.func.count(), sa.func.max(RUNS.c.heartbeat), studies, newest).select_from(RUNS)
     with database.reading() as connection:
-        rows = [_row_of(row) for row in connection.execute(sa.select(RUNS).where(RUNS.c.status == RUNNING))]
+        rows = map(_row_of, connection.execute(sa.select(RUNS).where(RUNS.c.status == RUNNING)))
         running = [row.id for row in rows if row.status == RUNNING]
         return "/".join(map(str, [*connection.execute(facts).one(), *running])), bool(running)
 
@@ -302,32 +301,28 @@ def command_to_go_on(database: Database, kind: str, folder: Path) -> tuple[str, 
     return rows[0].command if rows and rows[0].status != COMPLETE else ()
 
 
-def unfinished(database: Database, kind: str, command: Sequence[str]) -> RunRow | None:
-    """Return the newest row with these command-line arguments. None if it is complete, or if there is no row."""
-    row = next((row for row in run_rows(database, kind) if row.command == tuple(command)), None)
-    return None if row is None or row.status == COMPLETE else row
+def interrupted(database: Database, kind: str, command: Sequence[str]) -> RunRow | None:
+    """Return the first row of a command that was interrupted, perhaps several times, and did not complete since.
+
+    None if its newest row is complete, if another command has made the same study or artifact since, or if there is no
+    row.
+
+    Args:
+        database: The database.
+        kind: Kind of the study or artifact.
+        command: Command-line arguments (without `kerv`).
+    """
+    first, rows = None, run_rows(database, kind)
+    name = next((row.name for row in rows if row.command == tuple(command)), None)
+    for row in rows:
+        if row.name == name:
+            if row.command != tuple(command) or row.status == COMPLETE:
+                break
+            first = row
+    return first
 
 
 def forget(database: Database, kind: str, name: str) -> None:
     """Delete all rows of commands that made this study or artifact (weights or data)."""
     with database.writing() as connection:
         connection.execute(sa.delete(RUNS).where(RUNS.c.kind == kind, RUNS.c.name == name))
-
-
-def interrupted_since(database: Database, kind: str, name: str, command: Sequence[str]) -> str:
-    """Return when a command that was interrupted, perhaps several times, was first started (ISO 8601).
-
-    Empty if the newest run of this study or artifact has other arguments or is complete.
-
-    Args:
-        database: The database.
-        kind: Kind of the study or artifact.
-        name: Name of the study or artifact.
-        command: Command-line arguments (without `kerv`) of the command.
-    """
-    since = ""
-    for row in run_rows(database, kind, name):
-        if row.command != tuple(command) or row.status == COMPLETE:
-            break
-        since = row.started
-    return since

@@ -15,17 +15,17 @@ from kerv_cli.base.paths import check_writable
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.engine.record import EpisodeRecord
-from kerv_cli.episodes.identity import OBSERVATION
+from kerv_cli.episodes.identity import OBSERVATION, without
 from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.resolve import ResolvedStudy
 from kerv_cli.episodes.runner import Request, Runner, close_worlds, is_recorded, run_batch
 from kerv_cli.episodes.settings import settings_from
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.events import Event, OnEvent, Outcome, SettingFailed
-from kerv_cli.lab.plan import ALL, Episode, Setting, all_episodes, plain_settings
+from kerv_cli.lab.plan import ALL, Episode, Setting, all_episodes
 from kerv_cli.lab.progress import Progress
 from kerv_cli.lab.queue import Queue, enqueue
-from kerv_cli.lab.runs import Run, interrupted_since, unfinished
+from kerv_cli.lab.runs import Run, interrupted
 from kerv_cli.lab.slurm import Array
 from kerv_cli.lab.store import ABOUT, ROLLOUT, SWEEP, Study
 from kerv_cli.lab.work import Prepare, work
@@ -88,7 +88,7 @@ def study_of(resolved: ResolvedStudy, database: Database, kind: str = SWEEP) -> 
     for label, one in resolved.settings.items():
         point, identity = resolved.points[label], check(one)
         one.runtime.device = _device_of(one.runtime)
-        plain = plain_settings(asdict(one))
+        plain = without(asdict(one), {"task"})
         settings.append(Setting(label, " ".join(point.overrides), plain, identity, point.varies, point.name))
     settings.sort(key=lambda setting: setting.label != about.baseline)
     episodes = all_episodes(settings, resolved.tasks, about.block, about.repeats)
@@ -152,10 +152,10 @@ def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], ki
     check_writable(str(database.results))
     study = study_of(resolved, database, kind)
     if kind == SWEEP:
-        since = interrupted_since(database, SWEEP, study.name, command) if rerun == ALL else ""
-        return study.plan(rerun, since, runtime, command)
+        since = interrupted(database, SWEEP, command) if rerun == ALL else None
+        return study.plan(rerun, since.started if since else "", runtime, command)
     runtime = replace(runtime, workers=1, executor="local")
-    if row := unfinished(database, ROLLOUT, command):
+    if row := interrupted(database, ROLLOUT, command):
         rest = replace(study, name=row.name).plan(ALL, row.started, runtime, command)
         if rest.exists and rest.existing and rest.missing:
             return rest
