@@ -22,8 +22,8 @@ from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
 from kerv_cli.episodes.identity import without
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database, opened
-from kerv_cli.lab.events import OnEvent, Outcome
 from kerv_cli.lab.plan import Setting, all_episodes
+from kerv_cli.lab.progress import OnEvent, Outcome
 from kerv_cli.lab.runs import Run
 from kerv_cli.lab.store import Study
 from kerv_cli.lab.study import run_blocks

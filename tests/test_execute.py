@@ -34,15 +34,14 @@ from kerv_cli.base.errors import KervError, StorageError, UsageError
 from kerv_cli.base.registry import _PARTS, parts
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.cli.common import progress_bar
-from kerv_cli.cli.studies import event_printer, warnings_about
+from kerv_cli.cli.studies import event_printer
 from kerv_cli.lab.database import EPISODES, QUEUE, WANTED, Database, clock, opened
-from kerv_cli.lab.events import BlockStarted, EpisodeEnd, Event, Preparing, SettingFailed, Started
 from kerv_cli.lab.plan import blocks_of
-from kerv_cli.lab.progress import TimeLeft
+from kerv_cli.lab.progress import BlockStarted, EpisodeEnd, Event, Preparing, SettingFailed, Started, TimeLeft
 from kerv_cli.lab.queue import ClaimLost, Queue, enqueue
 from kerv_cli.lab.store import Study
 from kerv_cli.lab.work import work
-from kerv_cli.lab.workers import LocalWorkers, gpus_in_turn
+from kerv_cli.lab.workers import LocalWorkers, disturbances, gpus_in_turn
 from kerv_cli.report.tables import further_of, load_study
 from kerv_cli.worlds import EnvironmentPart
 
@@ -613,7 +612,7 @@ def test_a_plan_warns_of_workers_that_disturb_each_others_times(tmp_path, monkey
         settings = settings_of("ar")
         settings.runtime.device, settings.rollout.batch = device, batch
         runtime = RuntimeSettings(workers=workers)
-        return warnings_about(plan_study(database, study_of({"ar": settings}, ["reach-v3"]), runtime=runtime))
+        return disturbances(plan_study(database, study_of({"ar": settings}, ["reach-v3"]), runtime=runtime))
 
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
     assert warnings(1) == warnings(2, "cuda") == warnings(2, batch=16) == []

@@ -196,13 +196,13 @@ def test_a_rerun_repeats_the_tokens_in_a_folder_of_its_own(copy):
 def test_an_interrupted_rollout_goes_on_where_it_was(policies, tmp_path, monkeypatch):
     shutil.copytree(policies / "artifacts", tmp_path / "results" / "artifacts")
     command = ["rollout", "method=ar", "episodes=3", *FAST, f"results={tmp_path}/results"]
-    original = EpisodeRunner.__call__
+    original, last = EpisodeRunner.__call__, 100_001
 
     def interrupted(self, setting, task):
         run = original(self, setting, task)
 
         def episode(seed):
-            if seed == 100_001:
+            if seed == last:
                 raise KeyboardInterrupt
             return run(seed)
 
@@ -211,10 +211,13 @@ def test_an_interrupted_rollout_goes_on_where_it_was(policies, tmp_path, monkeyp
     monkeypatch.setattr(EpisodeRunner, "__call__", interrupted)
     stopped = kerv(*command, code=130)
     assert "1 of 3 episodes of" in stopped.stderr
-    monkeypatch.setattr(EpisodeRunner, "__call__", original)
     assert listed(tmp_path / "results")[0]["state"] == "1 of 3 episodes"
+    last = 100_002
+    stopped = kerv(*command, code=130)
+    assert "1 of 3 episodes are there" in stopped.stderr
+    monkeypatch.setattr(EpisodeRunner, "__call__", original)
     again = kerv(*command)
-    assert "1 of 3 episodes are there" in again.stderr
+    assert "2 of 3 episodes are there" in again.stderr
     assert len(listed(tmp_path / "results", "kind=rollout")) == 1
     assert works(*command)  # complete: the same command is a new run
     assert len(listed(tmp_path / "results", "kind=rollout")) == 2

@@ -16,7 +16,7 @@ from studies_synthetic import swept, threshold_study, unhurried
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import RuntimeSettings, SlurmOptions
 from kerv_cli.lab.database import EPISODES, QUEUE, opened
-from kerv_cli.lab.events import EpisodeEnd
+from kerv_cli.lab.progress import EpisodeEnd
 from kerv_cli.lab.store import Study
 from kerv_cli.lab.study import Detached
 
@@ -99,7 +99,7 @@ def jobs() -> list[str]:
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch, slurm):
-    monkeypatch.setattr("kerv_cli.lab.slurm._LOOK_SECONDS", 0.5)
+    monkeypatch.setattr("kerv_cli.lab.workers._LOOK_SECONDS", 0.5)
     monkeypatch.setenv("LAPSE", "2")
 
 

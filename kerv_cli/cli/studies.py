@@ -22,8 +22,7 @@ from kerv_cli.cli.common import (
 
 if TYPE_CHECKING:
     from kerv_cli.episodes.resolve import ResolvedStudy
-    from kerv_cli.lab.events import Event, Outcome
-    from kerv_cli.lab.progress import TimeLeft
+    from kerv_cli.lab.progress import Event, Outcome, TimeLeft
     from kerv_cli.lab.store import Study
     from kerv_cli.report.reprice import Priced
     from kerv_cli.report.tables import StudyData
@@ -52,14 +51,15 @@ def planned_study(resolved: ResolvedStudy, command: Sequence[str], is_rollout: b
     from kerv_cli.episodes.resolve import idle_overrides
 
     settings, tasks = resolved.settings, resolved.tasks
-    for override, reason in idle_overrides(resolved, not is_rollout).items():
-        typer.echo(f"note: {override} has no effect: {reason}", err=True)
     what = next(iter(settings)) if len(settings) == 1 else f"{len(settings)} settings"
     whose = _few(list(dict.fromkeys(setting.policy.target for setting in settings.values())), "targets")
     number = len(settings) * len(tasks) * resolved.first.episodes * resolved.study.repeats
+    where = _few(tasks, "tasks")
+    for override, reason in idle_overrides(resolved, not is_rollout).items():
+        typer.echo(f"note: {override} has no effect: {reason}", err=True)
     # printed before torch and the simulator load
-    typer.echo(f"{what} of {whose} on {_few(tasks, 'tasks')}: {count(number, 'episode')}", err=True)
-    from kerv_cli.episodes.tasks import unseen_tasks
+    typer.echo(f"{what} of {whose} on {where}: {count(number, 'episode')}", err=True)
+    from kerv_cli.episodes.resolve import unseen_tasks
     from kerv_cli.lab.database import opened
     from kerv_cli.lab.store import ROLLOUT, SWEEP
     from kerv_cli.lab.study import plan
@@ -103,6 +103,7 @@ def print_study_plan(planned: Study, as_json: bool, guess: float = SECONDS_PER_E
         guess: Seconds per episode if none was measured.
     """
     from kerv_cli.lab.progress import TimeLeft
+    from kerv_cli.lab.workers import disturbances
 
     rows, to_run, reused = _plan_rows(planned), planned.to_run, planned.existing
     left = TimeLeft(planned, guess)
@@ -110,7 +111,7 @@ def print_study_plan(planned: Study, as_json: bool, guess: float = SECONDS_PER_E
         end_with_json({"study": planned.name, "folder": planned.root, "settings": rows, "to run": len(to_run),
                        "reused": len(reused), "seconds": left.seconds, "source": left.source})  # fmt: skip
     print_rows(rows, f"study {planned.name}, episodes")
-    for warning in warnings_about(planned):
+    for warning in disturbances(planned):
         typer.echo(f"kerv: warning: {warning}", err=True)
     typer.echo(f"{count(len(to_run), 'episode')} to run, {len(reused)} reused, {about(left.seconds, left.source)}")
 
@@ -135,23 +136,6 @@ def _plan_rows(planned: Study) -> list[dict[str, object]]:
             }
         )
     return rows
-
-
-def warnings_about(planned: Study) -> list[str]:
-    """Return what disturbs the times of a plan's episodes, a sentence each: workers that share a GPU or a CPU."""
-    from kerv_cli.lab.workers import gpus_in_turn
-
-    runtime = planned.runtime
-    if runtime.workers == 1 or runtime.executor != "local" or all(block.batch > 1 for block in planned.blocks):
-        return []
-    gpus = len(gpus_in_turn(planned.device))
-    if planned.device != "cuda":
-        shared = "share this machine's memory: each needs a core and a memory channel of its own"
-    elif runtime.workers > gpus:
-        shared = f"share {count(gpus, 'GPU')}"
-    else:
-        return []
-    return [f"{runtime.workers} workers measure times and {shared} (docs/scale.md)"]
 
 
 def run_study(planned: Study, guess: float = SECONDS_PER_EPISODE) -> Outcome:
@@ -182,7 +166,7 @@ def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None =
         show: Moves the bar, see `progress_bar`.
         left: Estimates the time left. None: it is not shown.
     """
-    from kerv_cli.lab.events import BlockStarted, BlocksWait, Preparing, SettingFailed, Started
+    from kerv_cli.lab.progress import BlockStarted, BlocksWait, Preparing, SettingFailed, Started
 
     total = ended = 0
     title = "starting"

@@ -24,7 +24,7 @@ from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 
 if TYPE_CHECKING:
     from kerv_cli.episodes.resolve import ResolvedStudy
-    from kerv_cli.lab.events import Outcome
+    from kerv_cli.lab.progress import Outcome
     from kerv_cli.lab.store import Study
 
 
@@ -62,7 +62,7 @@ def sweep(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_js
 
 def _list_studies(as_json: bool) -> None:
     """Print the studies in conf/study and the number of episodes of each."""
-    from kerv_cli.episodes.tasks import tasks_of
+    from kerv_cli.episodes.resolve import tasks_of
 
     rows = []
     for name in groups()["study"]:

@@ -22,7 +22,7 @@ def work(settings: WorkSettings) -> None:
     from kerv_cli.base.processes import end_with_input
     from kerv_cli.episodes.resolve import study_name
     from kerv_cli.lab.database import opened
-    from kerv_cli.lab.events import EpisodeEnd, Event
+    from kerv_cli.lab.progress import EpisodeEnd, Event
     from kerv_cli.lab.store import Study
 
     if not settings.study:

@@ -74,13 +74,16 @@ class RealClock:
         return Delay(seconds, steps, observed, dropped=stale)
 
 
-def check(settings: RolloutSettings, spec: EnvironmentSpec, target: TargetDescription | None) -> None:
+def check(settings: RolloutSettings, spec: EnvironmentSpec, target: TargetDescription | None) -> dict[str, str]:
     """Refuse settings of the clock that cannot work.
 
     Args:
         settings: The rollout's settings.
         spec: The environment.
         target: The policy's description; None for the expert.
+
+    Returns:
+        `{"profile": HASH}` with the SHA-256 of the profile that the rollout reads; empty if it reads none.
 
     Raises:
         UsageError: An episode would end before its first action, or all actions of a chunk are too old when they
@@ -89,7 +92,7 @@ def check(settings: RolloutSettings, spec: EnvironmentSpec, target: TargetDescri
     """
     timing = settings.rollout
     if timing.clock != REAL:
-        return
+        return {}
     if target is not None:
         latency_of(settings, target)
     elif timing.latency == PROFILE:
@@ -97,7 +100,7 @@ def check(settings: RolloutSettings, spec: EnvironmentSpec, target: TargetDescri
             "policy=expert with rollout.latency=profile: it has no forwards; use rollout.latency=constant or measured"
         )
     if timing.latency != CONSTANT:
-        return
+        return {"profile": sha256_of(_profile_path(settings))} if timing.latency == PROFILE else {}
     late = steps_during(timing.latency_ms / 1000.0, spec.actions.control_hz)
     horizon = spec.control_steps(settings.world.horizon)
     if late >= horizon:
@@ -111,18 +114,7 @@ def check(settings: RolloutSettings, spec: EnvironmentSpec, target: TargetDescri
             f"rollout.latency_ms={timing.latency_ms:g} with rollout.delay_compensation=chunk: all {steps} control "
             f"steps of a chunk are stale after {late}"
         )
-
-
-def profile_identity(settings: RolloutSettings) -> dict[str, str]:
-    """Return `{"profile": HASH}` with the SHA-256 of the profile that a rollout reads; empty if it reads none.
-
-    Raises:
-        UsageError: The profile does not exist.
-    """
-    timing = settings.rollout
-    if timing.clock != REAL or timing.latency != PROFILE:
-        return {}
-    return {"profile": sha256_of(_profile_path(settings))}
+    return {}
 
 
 def latency_of(settings: RolloutSettings, target: TargetDescription | None) -> Latency:

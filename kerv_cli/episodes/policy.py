@@ -16,8 +16,8 @@ from kerv_cli.engine.stopwatch import Stopwatch
 from kerv_cli.episodes import clock
 from kerv_cli.episodes.clock import RealClock
 from kerv_cli.episodes.identity import OBSERVATION
+from kerv_cli.episodes.resolve import tasks_of
 from kerv_cli.episodes.settings import WAITS, RolloutSettings
-from kerv_cli.episodes.tasks import tasks_of
 from kerv_cli.methods.artifacts import Artifacts, Use
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.settings import EXPERT, MethodSettings
@@ -68,13 +68,13 @@ def check(settings: RolloutSettings) -> dict[str, str]:
         if settings.rollout.batch > 1:
             raise UsageError(f"deviation_every={settings.deviation_every}: not in batches. Leave out rollout.batch")
     method.check(target, settings.rollout.batch)
-    clock.check(settings, spec, target)
+    profile = clock.check(settings, spec, target)
     world = dataclasses.asdict(settings.world)
     hashes = artifacts.check(method.needs, Use(method.settings, settings.runtime.dtype, spec.name, tasks, world))
     # stored with every episode, so that tables show which policies read the privileged state
     observation = str(target.settings.get(OBSERVATION, "vision"))
     observation = PRIVILEGED if observation == "state" else observation
-    return {**hashes, **clock.profile_identity(settings), OBSERVATION: observation}
+    return {**hashes, **profile, OBSERVATION: observation}
 
 
 def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:

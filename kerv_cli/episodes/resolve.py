@@ -1,4 +1,4 @@
-"""Composes the settings of a study or of a rollout, from preset files and the command line."""
+"""Composes the settings of a study or of a rollout, from preset files and the command line. It loads no torch."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from kerv_cli.base.files import read_yaml_lines
 from kerv_cli.base.limits import check_label
 from kerv_cli.base.registry import METHOD_KINDS
 from kerv_cli.episodes.identity import flat, without_effect
-from kerv_cli.episodes.settings import RolloutSettings, StudySettings, SweepSettings
-from kerv_cli.episodes.tasks import tasks_of, trained_tasks
+from kerv_cli.episodes.settings import DEFAULT_TASKS, RolloutSettings, StudySettings, SweepSettings
+from kerv_cli.methods.settings import EXPERT
+from kerv_cli.targets.checkpoint import TargetDescription, described
+from kerv_cli.targets.folders import find_target
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
 
 MOST_SEEDS = 10_000
@@ -244,6 +246,40 @@ def idle_overrides(resolved: ResolvedStudy, sweep: bool = True) -> dict[str, str
         in_each.append(without_effect(settings, resolved.common, sweep))
     everywhere = set(in_each[0]).intersection(*in_each)
     return reasons | {word: why for word, why in in_each[0].items() if word in everywhere}
+
+
+def tasks_of(settings: RolloutSettings) -> tuple[str, ...]:
+    """Return the full names of a rollout's tasks. By default they are the tasks that its target was trained on.
+
+    Raises:
+        UnknownName: A task does not exist.
+        CheckpointError: The target's description is damaged.
+    """
+    return resolve_tasks(settings.task or list(trained_tasks(settings)) or DEFAULT_TASKS)
+
+
+def trained_tasks(settings: RolloutSettings) -> tuple[str, ...]:
+    """Return the full names of the tasks that a rollout's target was trained on.
+
+    Empty for the expert, for a target that does not name its tasks, and for a missing target (`check` reports that).
+
+    Raises:
+        CheckpointError: The target's description is damaged.
+    """
+    if settings.policy.kind == EXPERT:
+        return ()
+    try:
+        folder = find_target(settings.results, settings.policy.target)
+    except UsageError:
+        return ()
+    names = described(folder, "target", TargetDescription).tasks
+    return resolve_tasks(names) if names else ()
+
+
+def unseen_tasks(settings: RolloutSettings, tasks: Iterable[str]) -> list[str]:
+    """Return the tasks that the target was not trained on. Empty if the target does not name its training tasks."""
+    trained = trained_tasks(settings)
+    return [task for task in tasks if trained and task not in trained]
 
 
 def study_name(study: str) -> str:

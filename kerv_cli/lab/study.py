@@ -21,15 +21,13 @@ from kerv_cli.episodes.resolve import ResolvedStudy
 from kerv_cli.episodes.runner import Request, Runner, close_worlds, is_recorded, run_batch
 from kerv_cli.episodes.settings import settings_from
 from kerv_cli.lab.database import Database
-from kerv_cli.lab.events import Event, OnEvent, Outcome, SettingFailed
 from kerv_cli.lab.plan import ALL, Episode, Setting, all_episodes
-from kerv_cli.lab.progress import Progress
+from kerv_cli.lab.progress import Event, OnEvent, Outcome, Progress, SettingFailed
 from kerv_cli.lab.queue import Queue, enqueue
 from kerv_cli.lab.runs import Run, interrupted
-from kerv_cli.lab.slurm import Array
 from kerv_cli.lab.store import ABOUT, ROLLOUT, SWEEP, Study
 from kerv_cli.lab.work import Prepare, work
-from kerv_cli.lab.workers import LocalWorkers, follow, gpus_in_turn
+from kerv_cli.lab.workers import Array, LocalWorkers, follow, gpus_in_turn
 
 SLURM = "slurm"
 Save = Callable[[EpisodeRecord, Path, str], object]
@@ -151,15 +149,14 @@ def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], ki
         raise UsageError("runtime.detach=true is for clusters: add runtime.executor=slurm")
     check_writable(str(database.results))
     study = study_of(resolved, database, kind)
-    if kind == SWEEP:
-        since = interrupted(database, SWEEP, command) if rerun == ALL else None
-        return study.plan(rerun, since.started if since else "", runtime, command)
-    runtime = replace(runtime, workers=1, executor="local")
-    if row := interrupted(database, ROLLOUT, command):
-        rest = replace(study, name=row.name).plan(ALL, row.started, runtime, command)
-        if rest.exists and rest.existing and rest.missing:
-            return rest
-    return replace(study, name=new_name(study)).plan(ALL, "", runtime, command)
+    if kind == ROLLOUT:
+        rerun, runtime = ALL, replace(runtime, workers=1, executor="local")
+    begun = interrupted(database, kind, command) if rerun == ALL else None
+    if kind == ROLLOUT:
+        done, total = replace(study, name=begun.name).counts() if begun else (0, 0)
+        begun = begun if 0 < done < total else None
+        study = replace(study, name=begun.name if begun else new_name(study))
+    return study.plan(rerun, begun.started if begun else "", runtime, command)
 
 
 def new_name(study: Study) -> str:

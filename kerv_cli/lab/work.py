@@ -22,9 +22,17 @@ from kerv_cli.base.errors import KervError, StorageError
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.episodes.identity import ENGINE, code_hash
 from kerv_cli.episodes.rows import decodes_table, episode_row, seconds_blob, table_blob
-from kerv_cli.lab import events
 from kerv_cli.lab.database import now
 from kerv_cli.lab.plan import Episode, Setting, seeds_text
+from kerv_cli.lab.progress import (
+    BlockStarted,
+    BlocksWait,
+    EpisodeEnd,
+    OnEvent,
+    Preparing,
+    SettingFailed,
+    load_per_core,
+)
 from kerv_cli.lab.queue import Claim, ClaimLost, Queue, patiently
 from kerv_cli.targets.provenance import stamp
 
@@ -38,12 +46,7 @@ Prepare = Callable[[Setting, str], RunEpisode]
 """Function that builds and warms up a setting's decoder for a task. Its method `together` runs batches."""
 
 
-def load_per_core() -> float:
-    """Return the load average of this machine per core."""
-    return round(os.getloadavg()[0] / (os.cpu_count() or 1), 2)
-
-
-def work(queue: Queue, prepare: Prepare, on_event: events.OnEvent = lambda event: None) -> None:
+def work(queue: Queue, prepare: Prepare, on_event: OnEvent = lambda event: None) -> None:
     """Run the blocks of a queue until none is left.
 
     If a setting fails, it is reported and the other settings go on. While other workers run all blocks that are left,
@@ -72,7 +75,7 @@ def work(queue: Queue, prepare: Prepare, on_event: events.OnEvent = lambda event
                 return
             else:
                 if not is_waiting:
-                    on_event(events.BlocksWait())
+                    on_event(BlocksWait())
                 is_waiting = True
                 _wait(queue)
 
@@ -86,15 +89,15 @@ def _wait(queue: Queue) -> None:
             return
 
 
-def failure_of(error: BaseException) -> events.SettingFailed:
+def failure_of(error: BaseException) -> SettingFailed:
     """Describe an error in one line. For errors that are not KervErrors, add the type, file and line."""
     trace = "".join(traceback.format_exception(error))
     text = " ".join(str(error).split())
     if isinstance(error, KervError):
-        return events.SettingFailed(text, trace, error)
+        return SettingFailed(text, trace, error)
     frames = traceback.extract_tb(error.__traceback__)
     line = f" ({os.path.basename(frames[-1].filename)}:{frames[-1].lineno})" if frames else ""
-    return events.SettingFailed(f"{type(error).__name__}: {text[:200]}{line}", trace)
+    return SettingFailed(f"{type(error).__name__}: {text[:200]}{line}", trace)
 
 
 @dataclass(eq=False)
@@ -116,7 +119,7 @@ class _Attempt:
     queue: Queue
     claim: Claim
     prepare: Prepare
-    on_event: events.OnEvent
+    on_event: OnEvent
     load: float
     started: str = field(default_factory=now)
     left: list[Episode] = field(default_factory=list)
@@ -134,9 +137,9 @@ class _Attempt:
         try:
             patiently(self._link_existing)
             if self.claim.killer is not None:
-                self._fail(self.claim.killer, events.SettingFailed("two workers died in this episode"))
+                self._fail(self.claim.killer, SettingFailed("two workers died in this episode"))
             if self.left:
-                self.on_event(events.BlockStarted(block))
+                self.on_event(BlockStarted(block))
                 if block.batch > 1:
                     self._run_batch()
                 else:
@@ -159,7 +162,7 @@ class _Attempt:
         for number, setting in enumerate(settings, 1):
             first = next((one for one in self.left if one.setting.work == setting.work), None)
             if first is not None:
-                self.on_event(events.Preparing(setting, number, len(settings)))
+                self.on_event(Preparing(setting, number, len(settings)))
                 runner = self._try(first, functools.partial(self.prepare, setting, first.task))
                 if runner is not None:
                     runners[setting.work] = runner
@@ -218,7 +221,7 @@ class _Attempt:
         self.running = next((other for other in self.left if other is not one), None)
         patiently(functools.partial(self._write, one, row, decodes))
         self.left.remove(one)
-        self.on_event(events.EpisodeEnd(one, bool(row["success"]), float(row["wall_seconds"])))
+        self.on_event(EpisodeEnd(one, bool(row["success"]), float(row["wall_seconds"])))
 
     def _write(self, one: Episode, row: dict[str, Any], decodes: bytes) -> None:
         """Write an episode and its decodes, link the episode to the study, and begin the next, in one transaction."""
@@ -236,7 +239,7 @@ class _Attempt:
         return {"id": f"{claim.run}-{secrets.token_hex(4)}", "run": claim.run, "seeds": seeds_text(claim.block.seeds),
                 "started": self.started, "code": code_hash(), "about": about}  # fmt: skip
 
-    def _fail(self, one: Episode, failure: events.SettingFailed) -> None:
+    def _fail(self, one: Episode, failure: SettingFailed) -> None:
         """Note that a setting failed on a task. Its remaining episodes in the block will not run.
 
         Raises:
@@ -255,7 +258,7 @@ class _Attempt:
         failure = replace(failure, episodes=tuple(same))
         self.on_event(failure)
 
-    def _write_failure(self, failed: list[Episode], failure: events.SettingFailed) -> None:
+    def _write_failure(self, failed: list[Episode], failure: SettingFailed) -> None:
         rest = [one.key for one in self.claim.block.episodes if one not in self.failed]
         with self.queue.database.writing() as connection:
             self.queue.hold(connection, self.claim, episodes=rest)
