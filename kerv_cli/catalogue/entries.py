@@ -118,34 +118,45 @@ class RunEntry:
 
 def find_runs(database: Database) -> list[RunEntry]:
     """Return all entries of a database and its results folder, newest first."""
-    rows: dict[tuple[str, str], RunRow] = {}
-    finished = set()
-    for row in run_rows(database):
-        rows.setdefault((row.kind, row.name), row)
-        if row.status == COMPLETE:
-            finished.add((row.kind, row.name, row.command))
-    runs = _studies(database, rows)
-    folder, kinds = database.results / "artifacts", artifact_kinds()
-    for parent in (database.results / "studies", database.results / "rollouts", *(folder / kind for kind in kinds)):
+    folder, rows = database.results / "artifacts", run_rows(database)
+    of_studies = (database.results / "studies", database.results / "rollouts")
+    for parent in (*of_studies, *map(folder.joinpath, artifact_kinds())):
         with contextlib.suppress(OSError):
             clean(parent)  # what killed commands left there
-    made = {run.id: run for kind in kinds for run in _artifacts(folder / kind, kind)}
-    for (kind, name), row in rows.items():
-        if kind in _STUDIES:
-            continue
-        entry = made.get(f"{kind}/{name}")
-        is_repeat = entry is not None and entry.state == COMPLETE and (kind, name, row.command) in finished
-        if row.status == RUNNING or (row.status != COMPLETE and not is_repeat):
-            entry = entry or RunEntry(f"{kind}/{name}", kind, folder / kind / name, "", "", (kind,))
-            state = f"{row.status}, {row.done} of {row.total}" if row.total else row.status
-            started = entry.started if is_repeat else row.started[:23]
-            entry = replace(entry, started=started, state=state, done=row.done, total=row.total)
-            entry = replace(entry, left=time_left(row), message=row.message)
-        if entry is not None:
-            made[entry.id] = replace(entry, command=row.command)
+    found = {(one.kind, one.folder.name): one for one in (*_studies(database), *_artifacts(folder))}
+    finished = {(row.kind, row.name, row.command) for row in rows if row.status == COMPLETE}
+    newest = {(row.kind, row.name): row for row in reversed(rows)}
+    for (kind, name), row in newest.items():
+        entry = found.get((kind, name))
+        if entry is None:
+            if kind in _STUDIES or row.status == COMPLETE:
+                continue  # what the command made was removed
+            entry = RunEntry(f"{kind}/{name}", kind, folder / kind / name, "", "", (kind,))
+        found[kind, name] = _with_command(entry, row, (kind, name, row.command) in finished)
     labels = labels_in(database)
-    labelled = [replace(run, labels=labels.get(run.id, {})) for run in (*runs, *made.values())]
+    labelled = [replace(run, labels=labels.get(run.id, {})) for run in found.values()]
     return sorted(labelled, key=lambda run: (run.started, run.id), reverse=True)
+
+
+def _with_command(entry: RunEntry, row: RunRow, is_finished: bool) -> RunEntry:
+    """Return an entry with what the newest command that makes it says.
+
+    Args:
+        entry: The entry, as its rows and files describe it.
+        row: The command.
+        is_finished: Whether the same command has finished once. Repeating it in vain does not harm an artifact.
+    """
+    entry, is_running = replace(entry, command=row.command), row.status == RUNNING
+    is_repeat = is_finished and entry.state == COMPLETE
+    if not entry.has_episodes and (row.status == COMPLETE or (is_repeat and not is_running)):
+        return entry
+    entry = replace(entry, left=time_left(row), message=row.message)
+    if entry.has_episodes:
+        state = f"{RUNNING}, {entry.done} of {entry.total} episodes" if is_running else entry.state
+        return replace(entry, started=entry.started if entry.episodes else row.started[:23], state=state)
+    state = f"{row.status}, {row.done} of {row.total}" if row.total else row.status
+    started = entry.started if is_repeat else row.started[:23]
+    return replace(entry, started=started, state=state, done=row.done, total=row.total)
 
 
 def find_run(database: Database, name: str, exact: bool = False) -> RunEntry:
@@ -226,7 +237,8 @@ def store_of(run: RunEntry, database: Database) -> Study:
     return Study(database, run.folder.name, run.kind)
 
 
-def _studies(database: Database, rows: Mapping[tuple[str, str], RunRow]) -> list[RunEntry]:
+def _studies(database: Database) -> Iterator[RunEntry]:
+    """Yield an entry for each study of a database."""
     every = WANTED.join(SETTINGS).outerjoin(EPISODES, EPISODES.c.id == WANTED.c.episode_id)
     group = SETTINGS.c.study_id, WANTED.c.task
     sums = sa.select(
@@ -239,40 +251,38 @@ def _studies(database: Database, rows: Mapping[tuple[str, str], RunRow]) -> list
     )
     with database.reading() as connection:
         studies, tasks, settings = (connection.execute(query).all() for query in (sa.select(STUDIES), sums, of_setting))
-    entries = []
     for study in studies:
-        row = rows.get((study.kind, study.name))
         mine = [one for one in tasks if one.study_id == study.id]
-        existing, every_one = sum(one.existing for one in mine), sum(one.all for one in mine)
-        state = "complete" if existing == every_one else f"{existing} of {every_one} episodes"
-        if row is not None and row.status == RUNNING:
-            state = f"{RUNNING}, {existing} of {every_one} episodes"
-        started = min((one.started for one in mine if one.started), default=row.started if row else study.created)
-        compared = [one for one in settings if one.study_id == study.id]
+        methods: dict[str, None] = {}
         made_from: dict[str, str] = {}
-        for label, kind, value in ((one.label, *pair) for one in compared for pair in one.identity.items()):
-            if kind != OBSERVATION and value and value not in made_from.values():
-                made_from[f"{kind} of {label}" if kind in made_from else kind] = value
-        entries.append(
-            RunEntry(
-                id=study.name,
-                kind=study.kind,
-                folder=Study(database, study.name, study.kind).root,
-                started=started[:23],
-                state=state,
-                methods=tuple(dict.fromkeys(one.method for one in compared)),
-                tasks=tuple(one.task for one in mine),
-                episodes=existing,
-                total=every_one,
-                done=existing,
-                left=time_left(row) if row else "",
-                message=row.message if row else "",
-                figures={"success": sum(one.successes or 0 for one in mine) / existing} if existing else {},
-                command=row.command if row else (),
-                made_from=made_from,
-            )
+        for one in settings:
+            if one.study_id == study.id:
+                methods[one.method] = None
+                _add_hashes(made_from, one.label, one.identity)
+        total = successes = existing = 0
+        for one in mine:
+            total, existing, successes = total + one.all, existing + one.existing, successes + (one.successes or 0)
+        yield RunEntry(
+            id=study.name,
+            kind=study.kind,
+            folder=Study(database, study.name, study.kind).root,
+            started=min((one.started for one in mine if one.started), default=study.created)[:23],
+            state=COMPLETE if existing == total else f"{existing} of {total} episodes",
+            methods=tuple(methods),
+            tasks=tuple(one.task for one in mine),
+            episodes=existing,
+            total=total,
+            done=existing,
+            figures={"success": successes / existing} if existing else {},
+            made_from=made_from,
         )
-    return entries
+
+
+def _add_hashes(made_from: dict[str, str], label: str, identity: Mapping[str, str]) -> None:
+    """Add the hashes of a setting's weights and data that no earlier setting uses, see `RunEntry.made_from`."""
+    for kind, value in identity.items():
+        if kind != OBSERVATION and value and value not in made_from.values():
+            made_from[f"{kind} of {label}" if kind in made_from else kind] = value
 
 
 def description_of(run: RunEntry) -> dict[str, Any]:
@@ -297,11 +307,13 @@ def _description(folder: Path, kind: str) -> Path:
     return folder / (own or f"{kind}.json")
 
 
-def _artifacts(folder: Path, kind: str) -> Iterator[RunEntry]:
-    for path in visible(folder):
-        # an interrupted recording and a training before its first validation have no description yet
-        if any(file.is_file() for file in (_description(path, kind), path / "recording.json", path / LOG)):
-            yield _artifact(path, kind)
+def _artifacts(folder: Path) -> Iterator[RunEntry]:
+    """Yield an entry for each artifact in a folder that has a folder for each kind."""
+    for kind in artifact_kinds():
+        for path in visible(folder / kind):
+            # an interrupted recording and a training before its first validation have no description yet
+            if any(map(Path.is_file, (_description(path, kind), path / "recording.json", path / LOG))):
+                yield _artifact(path, kind)
 
 
 def state_of(folder: Path, kind: str) -> str:

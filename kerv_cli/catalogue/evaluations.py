@@ -125,8 +125,7 @@ def import_evaluations(
         CheckpointError: A file is damaged.
     """
     by_label = labelled([read_evaluations(path) for path in paths], labels)
-    evaluations = [(label, one) for label, of_path in by_label.items() for one in of_path]
-    benchmarks = list(dict.fromkeys(one.benchmark for _, one in evaluations))
+    benchmarks = list(dict.fromkeys(one.benchmark for one in itertools.chain(*by_label.values())))
     name = name or re.sub(r"\W+", "_", "-".join(benchmarks))[:80].strip("_") or "imported"
     stored = Study(database, name)
     if stored.exists and stored.kind != IMPORT:
@@ -134,22 +133,20 @@ def import_evaluations(
     baseline = baseline or ("ar" if "ar" in by_label else next(iter(by_label)))
     if baseline not in by_label:
         raise UsageError(f"baseline={baseline}: the recordings are of {', '.join(by_label)}")
-    settings = {label: Setting(label, "", _settings(one[0]), _identity(one)) for label, one in by_label.items()}
-    episodes = {
-        episode: (one, recorded)
-        for label, one in evaluations
-        for episode, recorded in _episodes(settings[label], one, len(benchmarks) > 1)
-    }
-    notes = [line for label, one in evaluations for line in _notes(label, one)]
+    settings: list[Setting] = []
+    episodes: dict[Episode, tuple[Evaluation, RecordedEpisode | None]] = {}
+    notes: list[str] = []
+    for label, of_path in by_label.items():
+        setting = Setting(label, "", _settings(of_path[0]), _identity(of_path))
+        settings.append(setting)
+        for one in of_path:
+            notes += _notes(label, one)
+            for episode, recorded in _episodes(setting, one, len(benchmarks) > 1):
+                episodes[episode] = one, recorded
     title = f"{HARNESS}: {', '.join(benchmarks)}"
     about = title, baseline, "", "; ".join(notes)
-    study = Study(database, name, IMPORT, tuple(settings.values()), tuple(episodes), *about)
-    existing = (
-        _imported(database.results, episode, one, recorded)
-        for episode, (one, recorded) in episodes.items()
-        if recorded is not None
-    )
-    study.add(existing, words)
+    study = Study(database, name, IMPORT, tuple(settings), tuple(episodes), *about)
+    study.add(_existing(database.results, episodes), words)
     return name, notes
 
 
@@ -318,6 +315,15 @@ def _identity(evaluations: Sequence[Evaluation]) -> dict[str, str]:
     digest = hashlib.sha256(json.dumps(recorded, sort_keys=True).encode()).hexdigest()
     hashes = {str(k): str(v) for k, v in dict(evaluations[0].facts.get("identity") or {}).items()}
     return {"target": "", **hashes, "evaluation": digest, OBSERVATION: "of the benchmark"}
+
+
+def _existing(
+    results: Path, episodes: Mapping[Episode, tuple[Evaluation, RecordedEpisode | None]]
+) -> Iterator[ImportedEpisode]:
+    """Yield the recorded episodes for the database."""
+    for episode, (one, recorded) in episodes.items():
+        if recorded is not None:
+            yield _imported(results, episode, one, recorded)
 
 
 def _imported(results: Path, episode: Episode, one: Evaluation, recorded: RecordedEpisode) -> ImportedEpisode:
