@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import os
 import re
 import shlex
@@ -80,7 +81,7 @@ def show_episode(request: Request) -> Response:
     names = _names(episode.task, decodes)
     size = chunk_size(decodes, len(names))
     chunks = [outcomes_of(decode, size, len(names)) for decode in decodes]
-    counts = Counter(one.kind for chunk in chunks for one in chunk)
+    counts = Counter(one.kind for one in itertools.chain.from_iterable(chunks))
     command, why_not = command_of(found)
     text = request.query_params.get("decode", "")
     chosen = int(text) if re.fullmatch(r"\d{1,6}", text) and int(text) < len(decodes) else 0

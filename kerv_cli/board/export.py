@@ -197,9 +197,11 @@ class _Static(HTMLParser):
             elif not target:
                 return
             found |= {name: target} if target else {}
-        kept = {key: value for key, value in found.items() if not key.startswith("hx-")}
-        texts = (f' {key}="{html.escape(value)}"' if value is not None else f" {key}" for key, value in kept.items())
-        self.parts.append(f"<{tag}{''.join(texts)}>")
+        self.parts.append(f"<{tag}")
+        for key, value in found.items():
+            if not key.startswith("hx-"):
+                self.parts.append(f" {key}" if value is None else f' {key}="{html.escape(value)}"')
+        self.parts.append(">")
 
     def handle_endtag(self, tag: str) -> None:
         """Write an element's end."""

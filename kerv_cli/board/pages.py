@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -12,6 +11,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import HTMLResponse
 
+from kerv_cli.catalogue.entries import few
 from kerv_cli.lab.database import Database
 from kerv_cli.report.glossary import with_code
 from kerv_cli.report.results import is_number
@@ -31,12 +31,6 @@ _OWN_CONTENT = (
     "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
 """The policy of the board's pages: files of the board alone. No page contains a script or a style."""
-
-
-def few(names: Iterable[str], most: int = 3) -> str:
-    """Return the first names, and how many more there are: `ar, kerv, jacobi +4`."""
-    names = list(names)
-    return ", ".join(names[:most]) + (f" +{len(names) - most}" if len(names) > most else "")
 
 
 def page_of(run: str) -> str:

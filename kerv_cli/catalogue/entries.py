@@ -116,6 +116,11 @@ class RunEntry:
         return not self.has_episodes and any((self.folder / name).is_file() for name in (LOG, WEIGHTS))
 
 
+def few(names: Sequence[str], most: int = 3) -> str:
+    """Return the first names, and how many more there are: `ar, kerv, jacobi +4`."""
+    return ", ".join(names[:most]) + (f" +{len(names) - most}" if len(names) > most else "")
+
+
 def find_runs(database: Database) -> list[RunEntry]:
     """Return all entries of a database and its results folder, newest first."""
     folder, rows = database.results / "artifacts", run_rows(database)

@@ -82,11 +82,10 @@ def power(names: list[str], as_json: AsJson = False) -> None:
         assumed = {"lost= as given": given["lost"]}
         if not least <= given["lost"] <= most:
             raise UsageError(f"lost= with these rates is a number from {float(least):.3g} to {float(most):.3g}")
-    shares = {name: (float(lost), float(lost + gain)) for name, lost in assumed.items()}
-    plans: list[dict[str, Any]] = [
-        {"assumption": name, "lost": lost, "won": won, "pairs": pairs_for_power(lost, won)}
-        for name, (lost, won) in shares.items()
-    ]
+    plans: list[dict[str, Any]] = []
+    for name, loss in assumed.items():
+        lost, won = float(loss), float(loss + gain)
+        plans.append({"assumption": name, "lost": lost, "won": won, "pairs": pairs_for_power(lost, won)})
     if as_json:
         end_with_json(plans)
     rows, shown = [], []

@@ -73,7 +73,7 @@ def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a r
 )
 def list_(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """List the runs of a results folder, the newest first."""
-    from kerv_cli.catalogue.entries import find_runs, matching
+    from kerv_cli.catalogue.entries import few, find_runs, matching
     from kerv_cli.lab.database import opened
 
     filters = dict(word.partition("=")[::2] for word in names)
@@ -83,20 +83,12 @@ def list_(settings: CommandSettings, names: list[str], as_json: AsJson = False) 
     if not runs:
         typer.echo(f"no runs in {settings.results}" + (" that agree" if names else ""))
         return
-    rows = [
-        (run.id, run.kind, run.started.replace("T", " ")[:16], run.state, _few(run.methods), _few(run.tasks),
-         run.episodes or "", _success(run), ", ".join(run.tags))
-        for run in runs
-    ]  # fmt: skip
+    rows = []
+    for run in runs:
+        about = run.id, run.kind, run.started.replace("T", " ")[:16], run.state, few(run.methods), few(run.tasks)
+        success = f"{run.figures['success']:.0%}" if "success" in run.figures else ""
+        rows.append((*about, run.episodes or "", success, ", ".join(run.tags)))
     print_table(("run", "kind", "started, UTC", "state", "methods", "tasks", "episodes", "success", "tag"), rows)
-
-
-def _few(names: tuple[str, ...]) -> str:
-    return ", ".join(names[:3]) + (f" +{len(names) - 3}" if len(names) > 3 else "")
-
-
-def _success(run: RunEntry) -> str:
-    return f"{run.figures['success']:.0%}" if "success" in run.figures else ""
 
 
 def _entry_row(run: RunEntry) -> dict[str, object]:
@@ -147,8 +139,15 @@ def label(settings: CommandSettings, names: list[str]) -> None:
     from kerv_cli.catalogue.labels import LABELS, set_labels
     from kerv_cli.lab.database import opened
 
-    changes = dict(word.partition("=")[::2] for word in names if word.startswith(tuple(f"{one}=" for one in LABELS)))
-    (name,) = _run_names([word for word in names if word.partition("=")[0] not in changes])
+    changes: dict[str, str] = {}
+    others = []
+    for word in names:
+        kind, equals, text = word.partition("=")
+        if equals and kind in LABELS:
+            changes[kind] = text
+        else:
+            others.append(word)
+    (name,) = _run_names(others)
     if not changes:
         raise UsageError(f"write tag= or note=, as in 'kerv runs label {name} tag=baseline'")
     database = opened(settings.results)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import itertools
 from collections.abc import Iterable, Sequence
 from operator import attrgetter
 from pathlib import Path
@@ -58,11 +59,12 @@ def folder_of(resolved: ResolvedStudy) -> Path:
         UsageError: The study has only a baseline, a condition of `_check_conditions` is not met, its seeds are not
             selection seeds, or the folder belongs to a policy that kerv ships.
     """
-    baseline, *candidates = _settings(resolved)
+    candidates = _candidates(resolved)
     if not candidates:
         raise UsageError(f"study '{resolved.study.name}' has only its baseline: add a setting to certify")
     _check_conditions(resolved)
-    first, tasks = candidates[0], resolve_tasks(baseline.task)
+    first = next(iter(candidates.values()))
+    tasks = resolve_tasks(first.task)
     seeds = range(first.seed, first.seed + first.episodes)
     spec_of(tasks[0]).seeds.check(seeds, "selection", f"seed={first.seed}")
     return artifacts_of(first).new(CertificateArtifact.kind)
@@ -77,7 +79,7 @@ def _check_conditions(resolved: ResolvedStudy) -> None:
     Raises:
         UsageError: A condition is not met.
     """
-    baseline, first = _settings(resolved)[:2]
+    baseline, first = resolved.settings[resolved.study.baseline], next(iter(_candidates(resolved).values()))
     for label, other in resolved.settings.items():
         keys = _CONDITIONS if other is baseline else (*_CONDITIONS, *_OF_CANDIDATES)
         differing = [key for key in keys if attrgetter(key)(other) != attrgetter(key)(first)]
@@ -113,9 +115,14 @@ def planned_certificate(
         UsageError: The policy was tested before and `again` is not set, or its seeds were used before.
         CheckpointError: An artifact of a candidate is missing or damaged.
     """
-    baseline, first = _settings(resolved)[:2]
-    artifacts, tasks = artifacts_of(first), resolve_tasks(baseline.task)
-    hashes = artifacts.check(need for settings in _settings(resolved)[1:] for need in Method.of(settings).needs)
+    tested = _candidates(resolved)
+    first = next(iter(tested.values()))
+    artifacts, tasks = artifacts_of(first), resolve_tasks(first.task)
+    hashes = artifacts.check(itertools.chain.from_iterable(Method.of(one).needs for one in tested.values()))
+    candidates = []
+    for label, one in tested.items():
+        skip, draft = dataclasses.asdict(one.skip), dataclasses.asdict(one.prefill_draft)
+        candidates.append(Candidate(label, skip=skip, draft=draft))
     certificate = Certificate(
         target=hashes.pop("target"),
         actions=artifacts.description.actions,
@@ -129,11 +136,7 @@ def planned_certificate(
         margin=settings.margin,
         delta=settings.delta,
         seeds=seeds_text(one.seed for one in wanted),
-        candidates=[
-            Candidate(label, skip=dataclasses.asdict(one.skip), draft=dataclasses.asdict(one.prefill_draft))
-            for label, one in resolved.settings.items()
-            if label != resolved.study.baseline
-        ],
+        candidates=candidates,
         chosen=None,
         provenance={"command": "kerv calibrate success", "engine": ENGINE, **provenance(first.runtime.device)},
         made=now(),
@@ -288,7 +291,8 @@ def candidate_rows(certificate: Certificate) -> list[dict[str, str]]:
     return rows
 
 
-def _settings(resolved: ResolvedStudy) -> list[RolloutSettings]:
-    """Return the baseline's settings first, then the candidates' settings in the study's order."""
-    others = [settings for label, settings in resolved.settings.items() if label != resolved.study.baseline]
-    return [resolved.settings[resolved.study.baseline], *others]
+def _candidates(resolved: ResolvedStudy) -> dict[str, RolloutSettings]:
+    """Return the settings of a study other than its baseline by label, in the study's order."""
+    settings = dict(resolved.settings)
+    del settings[resolved.study.baseline]
+    return settings

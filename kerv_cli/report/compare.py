@@ -97,7 +97,8 @@ def pairs_to_compare(database: Database, first: str, second: str) -> list[tuple[
     ours, theirs = compared_runs(database, first), compared_runs(database, second)
     if ours[0].run.has_episodes != theirs[0].run.has_episodes:
         raise UsageError(f"{ours[0].run.id} and {theirs[0].run.id} cannot be compared: only one of them has episodes")
-    pairs = [(a, b) for a in ours for b in theirs if a.label == b.label]
+    others = {side.label: side for side in theirs}
+    pairs = [(side, others[side.label]) for side in ours if side.label in others]
     if len(pairs) < 2 and not (pairs and len(ours) == len(theirs) == 1):
         pairs = [(ours[0], side) for side in theirs if side != ours[0]]
     runs = {side.run.id: side.run for side in (ours[0], theirs[0]) if side.run.has_episodes}

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 from kerv_cli.report import statistics as stats
 from kerv_cli.report.measures import MARGIN
@@ -131,12 +132,7 @@ def safest_first(rows: Iterable[Result]) -> list[Result]:
     keep the study's order. The baseline, settings without pairs, and settings that were timed and were not faster are
     left out.
     """
-    tested = []
-    for row in rows:
-        speed = row.measures.episode_speedup.value
-        if not row.is_baseline and row.measures.pairs and not speed <= 1:
-            tested.append(row)
-    return sorted(tested, key=safety)
+    return sorted((row for row in rows if row.is_compared and not row.speed <= 1), key=safety)
 
 
 def safety(row: Result) -> tuple[float, float]:
@@ -186,12 +182,8 @@ def pareto(rows: Iterable[Result]) -> list[Result]:
 
     The baseline has speed 1. Rows without a measured speed are left out.
     """
-
-    def point(row: Result) -> tuple[float, float]:
-        speed = 1.0 if row.is_baseline else row.measures.episode_speedup.value
-        return speed, row.measures.success.value
-
-    timed = [row for row in rows if is_number(point(row)[0])]
+    point = attrgetter("speed", "measures.success.value")
+    timed = [row for row in rows if is_number(row.speed)]
     front: list[Result] = []
     for row in sorted(timed, key=point, reverse=True):
         if not front or point(row)[1] > point(front[-1])[1] or point(row) == point(front[-1]):
@@ -213,7 +205,7 @@ def with_matched_speed(rows: Sequence[Result]) -> list[Result]:
     solved = {(row.where, row.label) for row in rows if row.is_baseline and row.measures.success.value >= SOLVED}
     groups: dict[tuple[str, str, str], list[Result]] = {}
     for row in rows:
-        if (row.where, row.baseline) in solved and not row.is_baseline and row.measures.pairs:
+        if (row.where, row.baseline) in solved and row.is_compared:
             groups.setdefault((row.where, row.method, row.baseline), []).append(row)
     fastest: dict[tuple[str, str, str], float] = {}
     for key, group in groups.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import fields
@@ -226,7 +227,7 @@ def _means(episodes: pd.DataFrame, by: list[str]) -> pd.DataFrame:
     decodes = (1000.0 * np.concatenate(list(arrays)) for _, arrays in groups["decode_seconds"])
     latencies = np.transpose([np.quantile(one, list(quantiles.values())) for one in decodes])
     means = episodes[by].assign(**each).groupby(by).mean().assign(**dict(zip(quantiles, latencies, strict=True)))
-    sums = groups[list({name: None for pair in _RATIOS.values() for name in pair})].sum()
+    sums = groups[list(dict.fromkeys(itertools.chain.from_iterable(_RATIOS.values())))].sum()
     for name, (above, below) in _RATIOS.items():
         means[name] = sums[above] / sums[below].mask(sums[below] == 0)
     means["felt_latency_ms"] *= 1000.0

@@ -21,6 +21,7 @@ Row = dict[str, Any]
 
 MICRO = "micro over tasks"
 MACRO = "macro over difficulty groups"
+ONE_TASK = "one task"
 RATIO = "ratio"
 """Key of a measure's metadata: the columns of the episodes whose sums are its numerator and its denominator."""
 
@@ -130,7 +131,7 @@ class Result:
 
     Attributes:
         study: Name of the study.
-        averaging: MICRO if all episodes are pooled, MACRO if difficulty groups are averaged, or `one task`.
+        averaging: MICRO if all episodes are pooled, MACRO if difficulty groups are averaged, or ONE_TASK.
         label: Label of the setting.
         series: Name that the settings along the study's axis share.
         unstressed: Label of the same setting without stress.
@@ -187,6 +188,16 @@ class Result:
     def is_baseline(self) -> bool:
         """Whether the row belongs to the baseline itself, which is not compared with anything."""
         return self.label == self.baseline
+
+    @property
+    def is_compared(self) -> bool:
+        """Whether there are pairs to compare the setting with its baseline. Never so for the baseline itself."""
+        return not self.is_baseline and self.measures.pairs > 0
+
+    @property
+    def speed(self) -> float:
+        """Speed per episode against the baseline. 1 for the baseline itself, NaN if it was not measured."""
+        return 1.0 if self.is_baseline else self.measures.episode_speedup.value
 
 
 def columns_of(values: Mapping[str, Any]) -> Row:

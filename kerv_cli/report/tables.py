@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from kerv_cli.lab.store import Study
 from kerv_cli.report import statistics as stats
 from kerv_cli.report.decide import with_matched_speed
 from kerv_cli.report.measures import Speeds, compared, measure, paired, speedups
-from kerv_cli.report.results import MACRO, MICRO, Result, Row, averaged, columns_of, frame_of, is_number
+from kerv_cli.report.results import MACRO, MICRO, ONE_TASK, Result, Row, averaged, columns_of, frame_of, is_number
 from kerv_cli.report.statistics import PairedCounts
 from kerv_cli.report.tally import Tally
 from kerv_cli.targets.provenance import PACKAGES
@@ -130,12 +131,8 @@ class StudyData:
 
         Empty if the settings run under several conditions, or if fewer than two were timed.
         """
-        timed: dict[str, float] = {}
-        for row in averaged(self.results):
-            speed = 1.0 if row.is_baseline else row.measures.episode_speedup.value
-            if not math.isnan(speed):
-                timed[row.label] = speed
-        order = sorted(timed, key=timed.__getitem__, reverse=True)
+        timed = [row for row in averaged(self.results) if is_number(row.speed)]
+        order = [row.label for row in sorted(timed, key=attrgetter("speed"), reverse=True)]
         if len(order) < 2 or len(set(self.references.values())) > 1:
             return []
         next_ones = dict(itertools.pairwise(order))
@@ -160,7 +157,7 @@ class StudyData:
     @functools.cached_property
     def task_results(self) -> list[Result]:
         """One row per task and setting. Tasks are sorted by name, settings are in the study's order."""
-        return with_matched_speed(_results(self, "one task", by_task=True))
+        return with_matched_speed(_results(self, ONE_TASK))
 
     @functools.cached_property
     def table(self) -> pd.DataFrame:
@@ -295,30 +292,30 @@ def difficulty_of(task: str) -> str:
     return next((spec.tasks[task].difficulty for spec in specs().values() if task in spec.tasks), "other")
 
 
-def _results(data: StudyData, averaging: str, by_task: bool = False) -> list[Result]:
+def _results(data: StudyData, averaging: str) -> list[Result]:
     """Return a row per setting, or per task and setting, in the study's order.
 
     Args:
         data: The study.
-        averaging: MICRO (pool all episodes), MACRO (average over difficulty groups), or any other name for the episodes
-            of one task.
-        by_task: Whether to return rows per task.
+        averaging: MICRO (pool all episodes), MACRO (average over difficulty groups) or ONE_TASK (a row for each task).
     """
-    by = ["task", "label"] if by_task else ["label"]
+    by = ["task", "label"] if averaging == ONE_TASK else ["label"]
     measured = measure(data.episodes, data.pairs, by, averaging)
     runs = [speedups(paired(run, data.references), by, averaging) for run in data.runs]
     indices = data.episodes.groupby(by).indices
-    texts = _texts_of(data.episodes)
+    texts = data.episodes.reindex(columns=["task", "difficulty", "seed", "repeat", *_PROVENANCE]).astype(object)
+    texts = texts.where(texts.notna(), None)
+
+    def key_of(group: Any) -> tuple[str, str]:
+        return group if averaging == ONE_TASK else ("", group)
 
     def order(group: Any) -> tuple[str, int]:
-        task, label = group if by_task else ("", group)
+        task, label = key_of(group)
         return task, data.labels.index(label)
 
     results = []
-    groups: list[Any] = sorted(indices, key=order)
-    for group in groups:
-        values = {name: pd.unique(column[indices[group]]) for name, column in texts.items()}
-        label = group[1] if by_task else group
+    for group in sorted(indices, key=order):
+        part, (_, label) = texts.iloc[indices[group]], key_of(group)
         measures = measured[group]
         if runs:
             measures = replace(measures, **_over_runs(runs, group, data.same_pairs)._asdict())
@@ -331,12 +328,12 @@ def _results(data: StudyData, averaging: str, by_task: bool = False) -> list[Res
             series=_series_of(setting, data.study.axis),
             unstressed=data.unstressed[label],
             method=setting.settings["method"],
-            task=_joined(sorted(values["task"])),
-            tasks=len(values["task"]),
-            difficulty=_joined(sorted(values["difficulty"])),
-            seeds=seeds_text(values["seed"]),
-            repeats=len(values["repeat"]),
-            episodes=len(indices[group]),
+            task=_joined(sorted(part["task"].unique())),
+            tasks=part["task"].nunique(),
+            difficulty=_joined(sorted(part["difficulty"].unique())),
+            seeds=seeds_text(part["seed"].unique()),
+            repeats=part["repeat"].nunique(),
+            episodes=len(part),
             baseline=data.references[label],
             measures=measures,
             runs=max(1, len(runs)),
@@ -346,7 +343,7 @@ def _results(data: StudyData, averaging: str, by_task: bool = False) -> list[Res
             hashes=_hashes_of(setting),
             stress=stress["kind"],
             stress_level=stress["level"],
-            provenance={name: _joined(values.get(name, ())) for name in _PROVENANCE},
+            provenance={name: _joined(part[name].unique()) for name in _PROVENANCE},
         )
         results.append(row)
     return results
@@ -364,16 +361,6 @@ def _over_runs(runs: Sequence[Mapping[Hashable, Speeds]], group: Hashable, same_
     if len(several) == 1:
         return several[0]
     return Speeds(*(stats.over_runs(speeds, same_pairs) for speeds in zip(*several, strict=True)))
-
-
-def _texts_of(episodes: pd.DataFrame) -> dict[str, np.ndarray]:
-    """Return those columns of the episodes of which a row names all values. Missing values are None."""
-    columns = {}
-    for name in ("task", "difficulty", "seed", "repeat", *_PROVENANCE):
-        if name in episodes:
-            column = episodes[name].astype(object)
-            columns[name] = column.where(column.notna(), None).to_numpy()
-    return columns
 
 
 def _series_of(setting: Setting, axis: str) -> str:

@@ -26,7 +26,7 @@ def verdict_of(results: Sequence[Result], loss: float) -> tuple[str, bool]:
         The sentence, and whether a setting is shown both to be faster and to lose less than `loss`.
     """
     rows = averaged(results)
-    if not any(row.measures.pairs and not row.is_baseline for row in rows):
+    if not any(row.is_compared for row in rows):
         rates = ", ".join(f"{row.label} {POINTS * row.measures.success.value:.1f} %" for row in rows)
         return f"success: {rates}.", False
     if len(baselines_of(rows)) > 1:
@@ -170,7 +170,7 @@ def under_conditions(rows: Sequence[Result]) -> str:
     failing: dict[str, None] = {}
     for row in rows:
         counts, difference = row.measures.counts, row.measures.difference
-        if row.is_baseline or not row.measures.pairs:
+        if not row.is_compared:
             continue
         if (counts.both + counts.only_baseline) / row.measures.pairs < SOLVED:
             failing[row.baseline] = None
