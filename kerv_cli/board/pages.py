@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -9,10 +11,11 @@ from urllib.parse import quote
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.responses import HTMLResponse
+from starlette.responses import HTMLResponse, Response
 
 from kerv_cli.catalogue.entries import few
 from kerv_cli.lab.database import Database
+from kerv_cli.lab.runs import pulse
 from kerv_cli.report.glossary import with_code
 from kerv_cli.report.results import is_number
 
@@ -50,6 +53,22 @@ def database_of(request: Request) -> Database:
     """Return the database of the results folder that the app shows."""
     database: Database = request.app.state.database
     return database
+
+
+def refreshed(page: Callable[[Request, str, bool], Response]) -> Callable[[Request], Response]:
+    """Decorate a page that asks for itself again and again. It is made only if the database has changed since.
+
+    The page is also given the database's version, and whether any command runs.
+    """
+
+    @functools.wraps(page)
+    def answer(request: Request) -> Response:
+        version, is_live = pulse(database_of(request))
+        if request.query_params.get("known") == version:
+            return Response(status_code=204)  # htmx leaves the page as it is
+        return page(request, version, is_live)
+
+    return answer
 
 
 def render(request: Request, template: str, status: int = 200, **values: Any) -> HTMLResponse:

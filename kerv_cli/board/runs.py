@@ -11,9 +11,8 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.board.pages import database_of, render
+from kerv_cli.board.pages import database_of, refreshed, render
 from kerv_cli.catalogue.entries import RunEntry, find_runs
-from kerv_cli.lab.runs import pulse
 from kerv_cli.report.compare import compare, pairs_to_compare
 
 STATES: dict[str, Callable[[RunEntry], bool]] = {
@@ -33,11 +32,9 @@ ORDERS: dict[str, Callable[[RunEntry], object]] = {
 """Columns by which the table can be sorted. A minus before the name reverses the order."""
 
 
-def show_runs(request: Request) -> Response:
+@refreshed
+def show_runs(request: Request, version: str, is_live: bool) -> Response:
     """Show studies, artifacts and unfinished commands. Unless the user sorts them, running ones come first."""
-    version, is_live = pulse(database_of(request))
-    if request.query_params.get("known") == version:
-        return Response(status_code=204)  # htmx leaves the page as it is
     asked = {name: request.query_params.get(name, "") for name in ("kind", "state", "text", "sort")}
     only = request.app.state.only
     every = [run for run in find_runs(database_of(request)) if not only or run.id in only]

@@ -13,10 +13,10 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.board.pages import database_of, render
+from kerv_cli.board.pages import database_of, refreshed, render
 from kerv_cli.catalogue.entries import find_runs, parents
 from kerv_cli.lab.database import Database
-from kerv_cli.lab.runs import RUNNING, pulse, run_rows
+from kerv_cli.lab.runs import RUNNING, run_rows
 from kerv_cli.lab.store import Study
 
 _SHARE = 0.01
@@ -46,12 +46,10 @@ def _parts(database: Database, name: str, version: str, is_running: bool) -> tup
     return parts, max(_SECONDS, (time.thread_time() - began) / (_SHARE * cores))
 
 
-def show_study(request: Request) -> Response:
+@refreshed
+def show_study(request: Request, version: str, is_live: bool) -> Response:
     """Show how far a study is. The tables follow in a second request, because many episodes take time to read."""
     database = database_of(request)
-    version, is_live = pulse(database)
-    if request.query_params.get("known") == version:
-        return Response(status_code=204)
     runs = find_runs(database)
     run = next((run for run in runs if run.id == request.path_params["name"] and run.has_episodes), None)
     if run is None:

@@ -7,18 +7,15 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from kerv_cli.base.errors import KervError, UsageError
-from kerv_cli.board.pages import database_of, render
+from kerv_cli.board.pages import database_of, refreshed, render
 from kerv_cli.catalogue.entries import RunEntry, children, description_of, disk_bytes, find_run, find_runs, parents
-from kerv_cli.lab.runs import pulse
 from kerv_cli.report.tables import flatten
 
 
-def show_artifact(request: Request) -> Response:
+@refreshed
+def show_artifact(request: Request, version: str, is_live: bool) -> Response:
     """Show one artifact, and its curves while it is trained."""
     database = database_of(request)
-    version, is_live = pulse(database)
-    if request.query_params.get("known") == version:
-        return Response(status_code=204)
     runs = find_runs(database)
     run = find_run(database, request.path_params["name"], exact=True)
     if not run.folder.is_relative_to(database.results):

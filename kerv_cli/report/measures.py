@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, NamedTuple
 
@@ -59,43 +59,31 @@ def measure(
     counted = episodes.assign(worlds=worlds, successes=worlds & episodes["success"].astype(bool))
     counts = counted.groupby(parts)[["successes", "worlds", "steps", "decodes", "deviation_count"]].sum()
     counts = counts.join(pairs.groupby(parts)[outcomes].sum()).fillna(0).astype(int)
-    groups: list[Hashable] = counts.reset_index("difficulty").index.tolist()
-    rates = [stats.wilson(*row) for row in counts[["successes", "worlds"]].to_numpy().tolist()]
-    changes = [stats.paired_difference(stats.PairedCounts(*row)) for row in counts[outcomes].to_numpy().tolist()]
-    success, difference = _averaged(groups, rates), _averaged(groups, changes)
-    sums = counts.groupby(level=by).sum().join(pairs.groupby(by)[["same_run", "same_block"]].mean())
-    means: dict[Hashable, Any] = _means(episodes, parts).groupby(level=by).mean().to_dict("index")
+    means = _means(episodes, parts).groupby(level=by).mean().join(pairs.groupby(by)[["same_run", "same_block"]].mean())
     speeds = speedups(pairs, by, averaging, all_pairs)
     measured: dict[Hashable, Measures] = {}
-    for group, row in sums.to_dict("index").items():
-        others = means[group]
-        pooled = stats.PairedCounts(*(row[name] for name in outcomes))
+    found: dict[Any, Any] = means.to_dict("index")
+    for group, others in found.items():
+        part = counts.loc[group, :]  # a row per difficulty group
+        rates = [stats.wilson(*row) for row in part[["successes", "worlds"]].to_numpy().tolist()]
+        changes = [stats.paired_difference(stats.PairedCounts(*row)) for row in part[outcomes].to_numpy().tolist()]
+        sums = part.sum().to_dict()
+        pooled = stats.PairedCounts(*map(sums.__getitem__, outcomes))
         measured[group] = Measures(
-            successes=row["successes"],
-            success=success[group],
+            successes=sums["successes"],
+            success=stats.mean_of(rates),
             phases={name: others.pop(name) for name in _PHASES},
             added={name: others.pop(name) for name in registered_columns()},
+            same_run=others.pop("same_run") == 1,
             **others,
-            **compared(pooled, difference[group]),
+            **compared(pooled, stats.mean_of(changes)),
             pairs_to_settle=stats.pairs_to_settle(pooled, MARGIN),
-            same_run=row["same_run"] == 1,
-            same_block=row["same_block"],
-            steps=row["steps"],
-            decodes=row["decodes"],
-            deviation_samples=row["deviation_count"],
+            steps=sums["steps"],
+            decodes=sums["decodes"],
+            deviation_samples=sums["deviation_count"],
             **speeds.get(group, Speeds())._asdict(),
         )
     return measured
-
-
-def _averaged(groups: Iterable[Hashable], estimates: Iterable[Estimate]) -> dict[Hashable, Estimate]:
-    """Return each group's mean estimate. `groups[i]` is the group of `estimates[i]`. NaN estimates are left out."""
-    known: dict[Hashable, list[Estimate]] = {}
-    for group, estimate in zip(groups, estimates, strict=True):
-        known.setdefault(group, [])
-        if not math.isnan(estimate.value):
-            known[group].append(estimate)
-    return {group: stats.mean_of(several) for group, several in known.items()}
 
 
 def compared(counts: stats.PairedCounts, difference: Estimate) -> dict[str, Any]:

@@ -75,15 +75,16 @@ def mean_of(groups: Sequence[Estimate]) -> Estimate:
     (method of variance estimates recovery: Zou and Donner, Statistics in Medicine 27, 2008).
 
     Args:
-        groups: One estimate per group. All must have the same confidence; the result has it, too.
+        groups: One estimate per group; NaN: no estimate. All must have the same confidence; the result has it, too.
 
     Returns:
-        The mean with its interval. All three numbers are NaN if there are no groups.
+        The mean of the known estimates with its interval. All three numbers are NaN if there are none.
     """
-    if not groups:
+    known = [group for group in groups if not math.isnan(group.value)]
+    if not known:
         return NO_ESTIMATE
-    values, lows, highs = np.array(groups).T
-    below, above = (math.sqrt(((bounds - values) ** 2).sum()) / len(groups) for bounds in (lows, highs))
+    values, lows, highs = np.array(known).T
+    below, above = (math.sqrt(((bounds - values) ** 2).sum()) / len(known) for bounds in (lows, highs))
     mean = float(values.mean())
     return Estimate(mean, mean - below, mean + above)
 
