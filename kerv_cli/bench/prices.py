@@ -61,21 +61,19 @@ _PUBLISHED_TOKENS = 7
 
 def computed(policy: Described, device: Device) -> list[NamedProfile]:
     """Return the costs of a policy on a device with each engine, named after the engine."""
-    assert policy.shape is not None
-    return [_computed(policy.shape, policy.encoder, device, engine) for engine in ENGINES.values()]
-
-
-def _computed(shape: Shape, encoder: float | None, device: Device, engine: Engine) -> NamedProfile:
-    profile = priced(shape, device, engine)
-    needs = {"encode": shape.needs("encode", 1), "prefill": shape.needs("prefill", shape.prompt)}
-    needs["verify"] = shape.needs("verify", 1)
-    bounds = {kind: engine.bound(one, device) for kind, one in needs.items()}
-    if encoder is not None:
-        profile = replace(profile, phases={**profile.phases, "encode": ((1,), (encoder,))})
-        bounds["encode"] = "given"
-    elif not profile.seconds("encode", 1):
-        bounds["encode"] = "none"
-    return NamedProfile(engine.name, profile, bounds)
+    shape, encoder, costs = policy.shape, policy.encoder, []
+    assert shape is not None
+    for engine in ENGINES.values():
+        profile, bounds = priced(shape, device, engine), {}
+        for kind, rows in {"encode": 1, "prefill": shape.prompt, "verify": 1}.items():
+            bounds[kind] = engine.bound(shape.needs(kind, rows), device)
+        if encoder is not None:
+            profile = replace(profile, phases={**profile.phases, "encode": ((1,), (encoder,))})
+            bounds["encode"] = "given"
+        elif not profile.seconds("encode", 1):
+            bounds["encode"] = "none"
+        costs.append(NamedProfile(engine.name, profile, bounds))
+    return costs
 
 
 @dataclass(frozen=True)

@@ -52,10 +52,8 @@ def export(run: RunEntry, database: Database, to: str, folder: Path) -> list[Pat
     if to == "trace":
         return [_to_trace(store, folder / f"{run.id}.jsonl")]
     path = folder / f"{run.id}.csv"
-    write_text(
-        path,
-        csv_text(_episodes(store).assign(**run.labels).drop(columns=["episode", "decode_seconds", "initial_state"])),
-    )
+    episodes = _episodes(store).assign(**run.labels)
+    write_text(path, csv_text(episodes.drop(columns=["episode", "decode_seconds", "initial_state"])))
     return [path]
 
 
@@ -94,24 +92,22 @@ def _to_trace(store: Study, path: Path) -> Path:
     frame, settings = _episodes(store), {one.label: one.settings for one in store.load().settings}
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for label, part in frame.groupby("label", sort=False):
-            chosen, size = settings.get(str(label), {}), 0
-            for rows in _decodes(store, part, ["tokens"]):
-                size = max(size, *(len(row["tokens"]) for row in rows))
+            chosen = settings.get(str(label), {})
+            size = max((len(row["tokens"]) for row in _decodes(store, part, ["tokens"])), default=0)
             prompt, levels = _prompt(store, chosen), levels_of(chosen)
-            for rows in _decodes(store, part, _TRACED):
-                for row in rows:
-                    about = {"episode": row["episode"], "setting": label, "prompt": prompt, "tokens": size}
-                    file.write(json.dumps({**about, **_line(row, levels)}) + "\n")
+            for row in _decodes(store, part, _TRACED):
+                about = {"episode": row["episode"], "setting": label, "prompt": prompt, "tokens": size}
+                file.write(json.dumps({**about, **_line(row, levels)}) + "\n")
     return path
 
 
-def _decodes(store: Study, episodes: pd.DataFrame, columns: Sequence[str]) -> Iterator[list[dict[str, Any]]]:
-    """Yield the decodes of some episodes at a time, with the episode's name in `episode`."""
+def _decodes(store: Study, episodes: pd.DataFrame, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Yield the decodes of some episodes, with the episode's name in `episode`. Read a hundred episodes at a time."""
     for start in range(0, len(episodes), _AT_ONCE):
         some = episodes.iloc[start : start + _AT_ONCE]
         names = [f"{task}/{seed}/{repeat}" for task, seed, repeat in some[["task", "seed", "repeat"]].to_numpy()]
-        rows = store.decodes(list(some["episode"]), columns).to_pylist()
-        yield [{**row, "episode": names[row["episode"]]} for row in rows]
+        for row in store.decodes(list(some["episode"]), columns).to_pylist():
+            yield {**row, "episode": names[row["episode"]]}
 
 
 def _prompt(store: Study, settings: Mapping[str, Any]) -> int | None:

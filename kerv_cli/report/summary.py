@@ -89,12 +89,12 @@ def _speed(row: Result, speed: Estimate) -> str:
 
 def cells_of(row: Result) -> dict[str, str]:
     """Return a row of a study's table as text, by the column's heading. The first `MAIN` columns are always shown."""
-    of, is_compared = row.measures, not row.is_baseline
+    of = row.measures
     return {
         "setting": row.label,
         "success": interval(of.success, ".0f", " %", 100.0),
         SPEEDS["episode_speedup"]: _speed(row, of.episode_speedup),
-        DIFFERENCE: interval(of.difference, "+.0f", "", 100.0, " to ") if is_compared else "",
+        DIFFERENCE: "" if row.is_baseline else interval(of.difference, "+.0f", "", 100.0, " to "),
         "tokens unverified": share(of.unverified_share),
         "slowest 5 % of decodes, ms": number(of.latency_p95_ms),
         SPEEDS["speedup"]: _speed(row, of.speedup),
@@ -111,7 +111,7 @@ def cells_of(row: Result) -> dict[str, str]:
         "failures near the object": share(of.near_contact_failure),
         **{name.replace("_", " "): number(value) for name, value in of.added.items()},
         "speed at matched success": number(row.matched_success_speed),
-        "pairs lost / won": f"{of.counts.only_baseline} / {of.counts.only_method}" if is_compared and of.pairs else "",
+        "pairs lost / won": f"{of.counts.only_baseline} / {of.counts.only_method}" if row.is_compared else "",
     }
 
 
@@ -211,7 +211,7 @@ def not_in_turn(results: Sequence[Result]) -> list[str]:
         if row.is_baseline and not of.is_timed:
             return []
         decodes = of.forwards_per_step + of.skip_rate > 0
-        if decodes and of.is_timed and of.pairs and not row.is_baseline and not is_number(of.speedup.value):
+        if row.is_compared and decodes and of.is_timed and not is_number(of.speedup.value):
             apart[row.label] = None
     return list(apart)
 

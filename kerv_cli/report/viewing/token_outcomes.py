@@ -143,14 +143,9 @@ def acceptance(decodes: Iterable[DecodeRecord]) -> tuple[float, ...]:
         Mean number of committed tokens, and mean number of accepted draft tokens, per verification. Empty if the
         decodes have no verification.
     """
-    verifications = committed = accepted = 0
-    for decode in decodes:
-        for one_round in decode.rounds:
-            if one_round.is_verification:
-                verifications += 1
-                committed += one_round.committed
-                accepted += one_round.accepted
-    return (committed / verifications, accepted / verifications) if verifications else ()
+    rounds = itertools.chain.from_iterable(decode.rounds for decode in decodes)
+    counts = [(one.committed, one.accepted) for one in rounds if one.is_verification]
+    return tuple(sum(column) / len(counts) for column in zip(*counts, strict=True))
 
 
 _SHOWN_SYMBOLS = "→✓≈–…≤≥αφσ"  # and those of OUTCOMES, which are among them or in Latin-1
