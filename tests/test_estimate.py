@@ -25,6 +25,7 @@ from kerv_cli.lab.store import Study
 from kerv_cli.report.profiles import open_profiles
 from kerv_cli.report.reprice import prices_table, repriced
 from kerv_cli.report.tables import load_study
+from kerv_cli.targets.folders import shipped_dir
 
 ROOT = Path(__file__).resolve().parent.parent
 OPENVLA = priced(SHAPES["openvla-7b"], DEVICES["a100"], ENGINES["eager"])
@@ -466,6 +467,18 @@ def test_a_trace_that_cannot_be_answered_is_refused(tmp_path, swept_results):
     assert "no drafted chain" in refusal("estimate", f"trace={trace}", "model=openvla-7b", "choose=draft", code=2)
     assert "weights=7B" in refusal("estimate", f"trace={trace}", code=2)
     assert "cannot be read" in refusal("estimate", f"trace={tmp_path / 'none'}", "weights=7B", code=1)
+
+
+def test_a_trace_that_a_profile_cannot_price_says_what_measures_the_cost(tmp_path):
+    document = json.loads((shipped_dir().parent / "bench" / "epyc-vla-150m-profile.json").read_text())
+    del document["profile"]["phases"]["draft"]
+    (tmp_path / "mine.json").write_text(json.dumps(document))
+    drafted = {"start": 1, "nodes": 3, "accepted": 2, "committed": 3, "proposer": "drafter"}
+    lines = {"episode": "0", "tokens": 7, "setting": "chain", "rounds": [{}, drafted]}
+    trace = write_trace(tmp_path / "t.jsonl", lines)
+    needed = "no cost of 'draft', which setting 'chain' needs. Measure it with 'kerv bench target=vla-150m tokens=7'"
+    for more in ((), ("choose=draft",)):
+        assert needed in refusal("estimate", f"trace={trace}", f"on={tmp_path / 'mine.json'}", *more, code=2)
     assert "needs trace=FILE" in refusal("estimate", "weights=7B", "choose=draft", code=2)
 
 
