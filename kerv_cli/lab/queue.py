@@ -188,16 +188,6 @@ class Queue:
         of_study: sa.ColumnElement[bool] = QUEUE.c.study_id == study
         return sa.and_(of_study, QUEUE.c.run == self.run) if self.run else of_study
 
-    def _here(self, work: str, setting: Setting) -> Setting:
-        """Return a setting that reads weights and data from this process's results folder.
-
-        Raises:
-            KervError: This version of kerv computes other results than the one that planned.
-        """
-        if setting.work != work:
-            raise KervError(f"{setting.label} was planned by another version of kerv: type the sweep again")
-        return replace(setting, settings={**setting.settings, "results": str(self.database.results)})
-
     def _claim_of(self, row: Any, killer: list[Any] | None) -> Claim:
         settings = self._settings_of(row)
         # a setting is missing if another command has planned the study anew, without it
@@ -208,13 +198,21 @@ class Queue:
         return Claim(row.id, row.run, row.about, Block(tuple(missing)), existing, guilty)
 
     def _settings_of(self, row: Any) -> dict[str, Setting]:
-        """Return the settings of a row's episodes, by their hashes."""
+        """Return the settings of a row's episodes, by their hashes. They read this process's results folder.
+
+        Raises:
+            KervError: This version of kerv computes other results than the one that planned.
+        """
         works = {work for work, *_ in row.episodes}
         if new := works - self._settings.keys():
             chosen = sa.select(SETTINGS).where(SETTINGS.c.study_id == row.study_id, SETTINGS.c.work.in_(new))
             with self.database.reading() as connection:
                 for one in connection.execute(chosen):
-                    self._settings[one.work] = self._here(one.work, setting_of(one))
+                    setting = setting_of(one)
+                    if setting.work != one.work:
+                        raise KervError(f"{setting.label} was planned by another version of kerv: type the sweep again")
+                    plain = {**setting.settings, "results": str(self.database.results)}
+                    self._settings[one.work] = replace(setting, settings=plain)
         return {work: self._settings[work] for work in works & self._settings.keys()}
 
     def hold(self, connection: sa.Connection, claim: Claim, running: Episode | None = None, **values: Any) -> None:

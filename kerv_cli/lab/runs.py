@@ -301,7 +301,7 @@ def command_to_go_on(database: Database, kind: str, folder: Path) -> tuple[str, 
     return rows[0].command if rows and rows[0].status != COMPLETE else ()
 
 
-def interrupted(database: Database, kind: str, command: Sequence[str]) -> RunRow | None:
+def interrupted(database: Database, kind: str, command: Sequence[str], name: str | None = None) -> RunRow | None:
     """Return the first row of a command that was interrupted, perhaps several times, and did not complete since.
 
     None if its newest row is complete, if another command has made the same study or artifact since, or if there is no
@@ -311,8 +311,9 @@ def interrupted(database: Database, kind: str, command: Sequence[str]) -> RunRow
         database: The database.
         kind: Kind of the study or artifact.
         command: Command-line arguments (without `kerv`).
+        name: Name of the study or artifact; None: as in the command's newest row.
     """
-    first, rows = None, run_rows(database, kind)
+    first, rows = None, run_rows(database, kind, name)
     name = next((row.name for row in rows if row.command == tuple(command)), None)
     for row in rows:
         if row.name == name:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import collections
 import functools
 import itertools
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +32,7 @@ from kerv_cli.lab.database import (
     measures_in,
     now,
 )
-from kerv_cli.lab.plan import NEVER, Block, Episode, Key, Setting, StoredEpisode, blocks_of, split
+from kerv_cli.lab.plan import NEVER, Block, Episode, Key, Setting, StoredEpisode, blocks_of, grouped, split
 from kerv_cli.lab.runs import Run, run_rows
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ class Study:
     @property
     def tasks(self) -> list[str]:
         """Names of the tasks, in order."""
-        return list(dict.fromkeys(one.task for one in self.episodes))
+        return list(dict.fromkeys(map(attrgetter("task"), self.episodes)))
 
     @functools.cached_property
     def to_run(self) -> list[Episode]:
@@ -213,7 +213,7 @@ class Study:
             raise UsageError(f"no study '{self.name}' in {self.database.shown}: {hint}")
         with self.database.reading() as connection, self.database.checking(f"study {self.name}"):
             settings, episodes = stored_settings(connection, row.id)
-        return replace(self, kind=row.kind, settings=tuple(settings.values()), episodes=episodes, **row.about)
+        return Study(self.database, self.name, row.kind, tuple(settings.values()), episodes, **row.about)
 
     def plan(
         self,
@@ -294,11 +294,11 @@ class Study:
         mine = SETTINGS.c.study_id == row.id
         connection.execute(sa.delete(SETTINGS).where(mine, SETTINGS.c.label.not_in(kept)))
         connection.execute(sa.update(STUDIES).where(STUDIES.c.id == row.id).values(about=about))
-        ids: dict[str, int] = {}
+        ids, of_label = dict[str, int](), grouped(self.episodes, attrgetter("setting.label"))
         for position, setting in enumerate(self.settings):
             ids[setting.label] = _save_setting(connection, row.id, position, setting)
-            planned = [one for one in self.episodes if one.setting.label == setting.label]
-            seeds, repeats = [one.seed for one in planned], [one.repeat for one in planned]
+            planned = of_label.get(setting.label, [])
+            seeds, repeats = list(map(attrgetter("seed"), planned)), map(attrgetter("repeat"), planned)
             still = sa.and_(
                 WANTED.c.task.not_in(self.tasks),
                 WANTED.c.seed.between(min(seeds, default=0), max(seeds, default=-1)),
@@ -337,12 +337,13 @@ class Study:
         """Return the ids of the commands that each ran all episodes of the study, oldest first."""
         wanted = PLANNED.join(EPISODES, _same_episode()).join(BLOCKS)
         keys = WANTED.c.setting_id, WANTED.c.task, WANTED.c.seed, WANTED.c.repeat
+        ran = (
+            sa.select(BLOCKS.c.run, *keys).distinct().select_from(wanted).where(STUDIES.c.name == self.name).subquery()
+        )
+        _, total = self.counts()
+        whole = sa.select(ran.c.run).where(ran.c.run != "").group_by(ran.c.run).having(sa.func.count() == total)
         with self.database.reading() as connection:
-            rows = connection.execute(
-                sa.select(BLOCKS.c.run, *keys).distinct().select_from(wanted).where(STUDIES.c.name == self.name)
-            ).all()
-        counts, (_, total) = collections.Counter(row.run for row in rows), self.counts()
-        return sorted(run for run, count in counts.items() if run and count == total)
+            return sorted(connection.scalars(whole))
 
     def frame(self, episodes: Iterable[Episode] | None = None, run: str | None = None) -> pd.DataFrame:
         """Return the episodes that have been run, in the study's order: one row per label, task, seed and repeat.
@@ -374,8 +375,8 @@ class Study:
                 return frame
             numbers = [column.name for column in MEASURES if isinstance(column.type, sa.Double | sa.BigInteger)]
             frame[numbers] = frame[numbers].apply(pd.to_numeric)
-            unknown = [name for name in numbers if frame[name].isna().all()]
-            frame = frame.astype(dict.fromkeys(unknown, float))
+            unknown = frame[numbers].isna().all()
+            frame = frame.astype(dict.fromkeys(unknown.index[unknown], float))
             frame["decode_seconds"] = frame["decode_seconds"].map(lambda blob: np.frombuffer(blob, "<f8"))
             about = pd.DataFrame(list(frame.pop("about")), index=frame.index)
         if episodes is not None:

@@ -151,7 +151,8 @@ def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], ki
     study = study_of(resolved, database, kind)
     if kind == ROLLOUT:
         rerun, runtime = ALL, replace(runtime, workers=1, executor="local")
-    begun = interrupted(database, kind, command) if rerun == ALL else None
+    known = None if kind == ROLLOUT else study.name  # a new rollout has no name yet
+    begun = interrupted(database, kind, command, known) if rerun == ALL else None
     if kind == ROLLOUT:
         done, total = replace(study, name=begun.name).counts() if begun else (0, 0)
         begun = begun if 0 < done < total else None
