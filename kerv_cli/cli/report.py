@@ -81,7 +81,7 @@ def report(
         print_prices(one.priced)
     for one in reports:
         if study is None:
-            typer.echo(one.data.study.name)
+            typer.echo(one.data.name)
         print_verdict(one.data, settings.loss)
 
 
@@ -92,7 +92,7 @@ def _as_json(reports: list[Report]) -> dict[str, object]:
     files, priced = [], []
     studies, acceptance = {}, {}
     for one in reports:
-        name, data = one.data.study.name, one.data
+        name, data = one.data.name, one.data
         files += one.files
         priced += one.priced
         studies[name] = data.table

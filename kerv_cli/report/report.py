@@ -118,7 +118,7 @@ def write_study(data: StudyData, loss: float, priced: Sequence[Priced] = (), pub
     """
     if publish:
         check_publishable(data)
-    results, name = data.study.database.results, data.study.name
+    results, name = data.study.database.results, data.name
     folder, page = results if publish else results / "report", data.study.root / "report.html"
     tables, document = [], folder / "tables" / f"{name}.json"
     for suffix, table in tables_of(data, priced).items():

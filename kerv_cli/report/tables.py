@@ -65,12 +65,14 @@ class StudyData:
             machine. Each run measured all episodes of the study, or all settings and tasks on seeds of its own. Empty
             if there are no such runs.
         same_pairs: Whether each run measured all episodes of the study.
+        against: What the tables' names add to the study's, if they compare with another baseline than the study does.
     """
 
     study: Study
     episodes: pd.DataFrame
     runs: tuple[pd.DataFrame, ...] = ()
     same_pairs: bool = False
+    against: str = ""
 
     @functools.cached_property
     def settings(self) -> dict[str, Setting]:
@@ -95,15 +97,20 @@ class StudyData:
         return references_of(self.study.settings, self.study.baseline)
 
     def compared_with(self, label: str) -> StudyData:
-        """Return the study with the setting `label` as its baseline, and with the name NAME_against_LABEL.
+        """Return the study with the setting `label` as its baseline. Its tables are named NAME_against_LABEL.
 
         Raises:
             UsageError: The study has no such setting.
         """
         if label not in self.settings:
             raise UsageError(f"baseline={label}: '{self.study.name}' has the settings {', '.join(self.labels)}")
-        name = f"{self.study.name}_against_{re.sub(r'[^A-Za-z0-9.]+', '_', label)}"
-        return replace(self, study=replace(self.study, name=name, baseline=label))
+        against = f"_against_{re.sub(r'[^A-Za-z0-9.]+', '_', label)}"
+        return replace(self, study=replace(self.study, baseline=label), against=against)
+
+    @property
+    def name(self) -> str:
+        """Name of the study's tables."""
+        return f"{self.study.name}{self.against}"
 
     @functools.cached_property
     def unstressed(self) -> dict[str, str]:
@@ -322,7 +329,7 @@ def _results(data: StudyData, averaging: str) -> list[Result]:
         setting = data.settings[label]
         stress = stress_of(setting.settings)
         row = Result(
-            study=data.study.name,
+            study=data.name,
             averaging=averaging,
             label=label,
             series=_series_of(setting, data.study.axis),
@@ -435,7 +442,7 @@ def further_of(data: StudyData) -> dict[str, Any]:
         labels.setdefault(row.label, about)["measures"][row.where] = _further_measures(row)
     for label, tally in data.tallies.items():
         labels[label]["acceptance"] = tally.as_dict()
-    return {"study": data.study.name, "axis": data.study.axis, "labels": labels}
+    return {"study": data.name, "axis": data.study.axis, "labels": labels}
 
 
 def _further_measures(row: Result) -> Row:
