@@ -213,7 +213,7 @@ class Study:
             raise UsageError(f"no study '{self.name}' in {self.database.shown}: {hint}")
         with self.database.reading() as connection, self.database.checking(f"study {self.name}"):
             settings, episodes = stored_settings(connection, row.id)
-        return Study(self.database, self.name, row.kind, tuple(settings.values()), episodes, **row.about)
+            return Study(self.database, self.name, row.kind, tuple(settings.values()), episodes, **row.about)
 
     def plan(
         self,
