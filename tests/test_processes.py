@@ -9,17 +9,27 @@ from pathlib import Path
 import pytest
 from conftest import until
 
-DEMOS = """
-import sys, time
-from joblib import delayed, Parallel, parallel_config
-from kerv_cli.worlds.demos import recording
-def sleep(*arguments):
-    open(sys.argv[1], "a").write(f"{__import__('os').getpid()}\\n")
-    time.sleep(60)
+JOB = """
+import os, time
 class Config:
     workers = 2
-recording._record_seeds = sleep
-list(recording._run_jobs(Config, None, [("a", range(1)), ("b", range(1))], None))
+def job(config, path, task, seeds, make_actor):
+    with open(path, "a") as file:
+        file.write(f"{os.getpid()}\\n")
+    if task == "dies":
+        os._exit(9)
+    time.sleep(60)
+"""
+DEMOS = """
+import signal, sys
+import job
+from kerv_cli.worlds.demos import recording
+signal.signal(signal.SIGINT, signal.default_int_handler)
+recording._record_seeds = job.job
+try:
+    list(recording._run_jobs(job.Config, sys.argv[1], [(sys.argv[2], range(1)), ("sleeps", range(1))], None))
+except (recording.KervError, KeyboardInterrupt) as error:
+    print(type(error).__name__, error, flush=True)
 """
 IMPORT = """
 import os, sys, time
@@ -62,16 +72,49 @@ def ended(pid: int) -> bool:
         return True
 
 
-@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
-def test_workers_that_record_end_with_a_killed_command(tmp_path):
-    """One that is stopped, too, and what else the command has started."""
-    path = tmp_path / "pids"
-    with subprocess.Popen([sys.executable, "-c", DEMOS, str(path)]) as process:
+@pytest.fixture
+def recording(tmp_path):
+    """Start a process that records with two workers. Return it and the processes that it and they have started."""
+    (tmp_path / "job.py").write_text(JOB)
+    path, started = tmp_path / "pids", []
+
+    def begin(first="sleeps"):
+        command = [sys.executable, "-c", DEMOS, str(path), first]
+        env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+        started.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=env))
         until(lambda: path.exists() and len(path.read_text().split()) == 2, 120)
         found = [int(pid) for pid in path.read_text().split()]
-        found += map(int, Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split())
-        os.kill(found[0], signal.SIGSTOP)
+        children = Path(f"/proc/{started[0].pid}/task/{started[0].pid}/children")
+        return started[0], [*found, *map(int, children.read_text().split() if children.exists() else ())]
+
+    yield begin
+    for process in started:
         process.kill()
+        process.communicate()
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
+def test_workers_that_record_end_with_a_killed_command(recording):
+    """One that is stopped, too, and what else the command has started."""
+    process, found = recording()
+    os.kill(found[0], signal.SIGSTOP)
+    process.kill()
+    until(lambda: all(map(ended, found)), 5)
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
+def test_workers_that_record_end_at_once_with_ctrl_c(recording):
+    process, found = recording()
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=5)[0].startswith("KeyboardInterrupt")
+    until(lambda: all(map(ended, found)), 5)
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs /proc")
+def test_a_worker_that_dies_ends_the_recording_and_the_other_workers(recording):
+    process, found = recording("dies")
+    said = process.communicate(timeout=10)[0]
+    assert said == "KervError a worker process was killed: run the same command again to go on\n"
     until(lambda: all(map(ended, found)), 5)
 
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import multiprocessing
 import os
 import signal
 import threading
 import time
+from concurrent.futures import ProcessPoolExecutor
 
 WATCH_SECONDS = 1.0
 """Seconds between two checks whether the parent process is alive."""
 
 _PR_SET_PDEATHSIG = 1
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 def end_with(parent: int) -> None:
@@ -38,11 +41,40 @@ def end_with(parent: int) -> None:
 def begin_worker(parent: int) -> None:
     """Prepare this process as a worker: it ends when its parent ends, and ignores Ctrl-C, which its parent handles.
 
+    Libraries that have not been imported yet compute in one thread, because the workers share the cores.
+
     Args:
         parent: Process id of the parent.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for name in _THREADS:
+        os.environ.setdefault(name, "1")
     end_with(parent)
+
+
+class Workers(ProcessPoolExecutor):
+    """A pool of worker processes, each a new interpreter. A fork could deadlock in a library that has threads.
+
+    Start it in a thread that lives as long as the workers; see `end_with`.
+
+    Args:
+        count: Number of processes.
+    """
+
+    def __init__(self, count: int) -> None:
+        super().__init__(count, multiprocessing.get_context("spawn"), begin_worker, (os.getpid(),))
+
+    @property
+    def is_broken(self) -> bool:
+        """Whether a process has died. The pool then takes no more work."""
+        return bool(self._broken)
+
+    def kill(self) -> None:
+        """End all processes at once, whatever they are doing, and drop the work that waits."""
+        processes = list((self._processes or {}).values())
+        self.shutdown(wait=False, cancel_futures=True)
+        for process in processes:
+            process.kill()
 
 
 def end_with_input() -> None:

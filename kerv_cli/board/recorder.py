@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from kerv_cli.base.processes import begin_worker
+from kerv_cli.base.processes import Workers
 from kerv_cli.catalogue.episodes import FoundEpisode
 from kerv_cli.lab.plan import Setting
 
@@ -49,8 +47,9 @@ class Recorder:
 
     def __init__(self) -> None:
         self._jobs: dict[Path, Job] = {}
-        self._pool: Any = None
-        self._lock = threading.Lock()
+        self._pool: Workers | None = None
+        self._latest: Future[str] | None = None
+        self._lock = threading.RLock()
 
     def job(self, path: Path) -> Job | None:
         """Return the newest job that writes this file. None if nobody asked for one."""
@@ -61,24 +60,36 @@ class Recorder:
 
         Call it in a thread that lives as long as the board: the recording process ends with it.
         """
-        from joblib.externals.loky import get_reusable_executor
-
         path = found.recording
         with self._lock:
             job = self._jobs.get(path)
             if job is not None and not job.future.done():
                 return
-            begin = {"initializer": begin_worker, "initargs": (os.getpid(),)}
-            self._pool = get_reusable_executor(max_workers=1, timeout=IDLE_SECONDS, **begin)
+            if self._pool is None or self._pool.is_broken:
+                self._pool = Workers(1)
             one, results = found.episode, str(found.store.database.results)
             seeds = [*found.earlier, one.seed]
             work = self._pool.submit(record_episode, one.setting, one.task, seeds, results, path)
-            self._jobs[path] = Job(work, time.time())
+            self._jobs[path], self._latest = Job(work, time.time()), work
+        work.add_done_callback(self._rest)
+
+    def _rest(self, work: Future[str]) -> None:
+        """End the process after IDLE_SECONDS, unless another recording was asked for after this one."""
+
+        def end() -> None:
+            with self._lock:
+                if work is self._latest:
+                    self.close()
+
+        timer = threading.Timer(IDLE_SECONDS, end)
+        timer.daemon = True
+        timer.start()
 
     def close(self) -> None:
         """End the process, whatever it is recording."""
         if self._pool is not None:
-            self._pool.shutdown(kill_workers=True)
+            self._pool.kill()
+            self._pool = None
 
 
 def record_episode(setting: Setting, task: str, seeds: list[int], results: str, path: Path) -> str:

@@ -14,9 +14,10 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import platform
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -29,7 +30,7 @@ from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import read_json, write_json
 from kerv_cli.base.limits import check_settings, limits, number
 from kerv_cli.base.manifests import read
-from kerv_cli.base.processes import begin_worker
+from kerv_cli.base.processes import Workers
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.demos.dataset import FORMAT, DemoManifest, EpisodeEntry, OnProgress, episode_path, totals
@@ -289,17 +290,15 @@ def _run_jobs(
     if config.workers == 1 or len(jobs) == 1:
         yield from (_record_seeds(config, out, task, seeds, make_actor) for task, seeds in jobs)
         return
-    from joblib import Parallel, delayed, parallel_config
-    from joblib.externals.loky.process_executor import BrokenProcessPool
-
-    # loky starts new interpreters. A fork after this process has drawn would deadlock in the OpenGL driver.
-    workers = {"n_jobs": min(config.workers, len(jobs)), "initializer": begin_worker, "initargs": (os.getpid(),)}
-    with parallel_config(backend="loky", inner_max_num_threads=1, **workers):
-        work = (delayed(_record_seeds)(config, out, task, seeds, make_actor) for task, seeds in jobs)
-        try:
-            yield from Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")(work)
-        except BrokenProcessPool as error:
-            raise KervError("a worker process was killed: run the same command again to go on") from error
+    pool = Workers(min(config.workers, len(jobs)))
+    try:
+        work = [pool.submit(_record_seeds, config, out, task, seeds, make_actor) for task, seeds in jobs]
+        for done in as_completed(work):
+            yield done.result()
+    except BrokenProcessPool as error:
+        raise KervError("a worker process was killed: run the same command again to go on") from error
+    finally:
+        pool.kill()
 
 
 def _record_seeds(
