@@ -17,7 +17,7 @@ help: ## list these rules
 setup: $(STAMP) ## install kerv and its tools into .venv (CUDA=1: with PyTorch for NVIDIA GPUs), and the OpenGL libraries if MuJoCo cannot draw
 	@scripts/graphics.sh $(BIN)/python
 
-$(STAMP): pyproject.toml requirements/cpu.txt requirements/cuda.txt
+$(STAMP): pyproject.toml requirements/common.txt requirements/cpu.txt requirements/cuda.txt
 	@PYTHON="$(PYTHON)" CUDA="$(CUDA)" scripts/install.sh $@
 
 # Files stay whole: their fixtures are shared. More than four processes wait for each other's rendering.
@@ -61,8 +61,8 @@ docs: setup ## build the pages as a site in build/site; a link that leads nowher
 	@$(BIN)/python -c 'import material' 2>/dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	@$(BIN)/mkdocs build --quiet
 
-lock: setup ## write requirements/*.txt from what is installed
-	@scripts/lock.sh $(BIN)/python
+lock: setup ## write requirements/*.txt from what is installed, with the hashes of the files
+	@$(BIN)/python scripts/lock.py
 
 clean: ## remove caches and built packages; keeps .venv and results
 	@rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis MUJOCO_LOG.TXT

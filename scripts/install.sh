@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# install.sh STAMP: make .venv and install kerv with its development tools into it, in the versions of requirements/.
+# install.sh STAMP: make .venv and install kerv with its development tools into it: the files that requirements/ names.
 # STAMP is written last, so that an interrupted installation is never taken for a finished one.
 # PYTHON=/path/to/python chooses the interpreter; CUDA=1 or CUDA=0 the build of PyTorch, by default that for CUDA where an
 # NVIDIA driver is, else the CPU's.
@@ -49,7 +49,6 @@ if ! { suits "$venv/bin/python" && "$venv/bin/python" -m pip --version >/dev/nul
 fi
 
 build=$(choose_build)
-versions=requirements/$build.txt
 if [ "$build" = cpu ]; then
     what="the CPU build of PyTorch, together about 0.6 GB to fetch (make setup CUDA=1 takes the build for NVIDIA GPUs, 3 GB)"
 else
@@ -63,15 +62,17 @@ pip() {
     # shellcheck disable=SC2086  # empty means no argument
     "$venv/bin/python" -m pip install $quiet --disable-pip-version-check "$@"
 }
-# By itself and without what it needs, so that the second index serves nothing else.
+# By itself and without what it needs, so that the second index serves nothing else. All else must have a known hash.
 if [ "$build" = cpu ]; then
-    torch=$(grep '^torch==' "$versions")
+    torch=$(grep '^torch==' requirements/cpu.txt)
     if ! "$venv/bin/python" -m pip freeze --disable-pip-version-check 2>/dev/null | grep -qxF "$torch" &&
         ! pip --no-deps --retries 1 --extra-index-url "$cpu_index" "$torch" 2>/dev/null; then
         echo "setup: $torch is not to be had here: taking the PyTorch that the package index offers (up to 3 GB)" >&2
-        versions=$venv/constraints.txt
-        grep -v '^torch==' requirements/cpu.txt >"$versions"
+        build=cuda
     fi
 fi
-pip --constraint "$versions" --editable '.[dev]'
+files=(--requirement requirements/common.txt)
+[ "$build" = cpu ] || files+=(--requirement requirements/cuda.txt)
+pip --no-deps --require-hashes "${files[@]}"
+pip --no-deps --no-build-isolation --editable '.[dev]'
 touch "$stamp"

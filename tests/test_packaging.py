@@ -2,6 +2,7 @@
 
 import email
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -12,11 +13,13 @@ from pathlib import Path
 import pytest
 from loaded import module_of
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from kerv_cli.targets import provenance
 
 ROOT = Path(__file__).resolve().parents[1]
 STAMP = Path(".venv/.kerv-installed")
+EDITABLE = "pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .[dev]"
 TOOLS = ("awk", "bash", "cat", "chmod", "dirname", "env", "grep", "make", "mkdir", "rm", "sleep", "touch")
 
 # --- the wheel ---
@@ -187,15 +190,16 @@ def test_setup_installs_once(checkout):
     index = "https://download.pytorch.org/whl/cpu"
     assert checkout.log == [
         f"{pip} --no-deps --retries 1 --extra-index-url {index} {locked('cpu', 'torch')}",
-        f"{pip} --constraint requirements/cpu.txt --editable .[dev]",
+        f"{pip} --no-deps --require-hashes --requirement requirements/common.txt",
+        EDITABLE,
     ]
     second = checkout.setup()
     assert (second.returncode, second.stdout, second.stderr) == (0, "", "")
-    assert len(checkout.log) == 2
+    assert len(checkout.log) == 3
     (checkout.root / STAMP).unlink()
     (checkout.root / "frozen").write_text(f"numpy==1\n{locked('cpu', 'torch')}\n")
     checkout.setup()
-    assert len(checkout.log) == 3, "PyTorch that is there is not fetched again"
+    assert len(checkout.log) == 5, "PyTorch that is there is not fetched again"
 
 
 def locked(build: str, package: str) -> str:
@@ -210,17 +214,15 @@ def test_another_pytorch_is_taken_where_the_locked_build_is_not_to_be_had(checko
     assert result.returncode == 0
     (line,) = setup_lines(result)
     assert line.startswith(f"setup: {locked('cpu', 'torch')} is not to be had here: taking the PyTorch that")
-    assert checkout.log[-1].endswith("--constraint .venv/constraints.txt --editable .[dev]")
-    kept = (checkout.root / ".venv/constraints.txt").read_text()
-    assert "\ntorch==" not in kept
-    assert locked("cpu", "numpy") in kept
+    assert checkout.log[-2].endswith("--requirement requirements/common.txt --requirement requirements/cuda.txt")
+    assert checkout.log[-1] == EDITABLE
 
 
 def test_an_nvidia_driver_or_a_request_chooses_the_build_and_setup_says_what_it_fetches(checkout):
     asked = checkout.setup(CUDA="1")
     assert "CUDA build of PyTorch" in asked.stdout
     assert "CUDA=0" in asked.stdout
-    assert checkout.log[-1].endswith("--constraint requirements/cuda.txt --editable .[dev]")
+    assert checkout.log[-2].endswith("--requirement requirements/common.txt --requirement requirements/cuda.txt")
     assert checkout.setup(CUDA="1").stdout == ""
     back = checkout.setup()  # the other build is another installation
     assert "CPU build of PyTorch" in back.stdout
@@ -231,16 +233,24 @@ def test_an_nvidia_driver_or_a_request_chooses_the_build_and_setup_says_what_it_
     assert "CPU build of PyTorch" in checkout.setup(CUDA="0").stdout
 
 
-def test_the_two_lock_files_differ_in_pytorch_alone_and_hold_every_requirement(metadata):
-    cpu, cuda = ((ROOT / "requirements" / f"{build}.txt").read_text().splitlines()[1:] for build in ("cpu", "cuda"))
-    assert set(cpu) ^ set(cuda) == {locked("cpu", "torch"), locked("cuda", "torch")}
-    names = {line.split("==")[0].lower().replace("_", "-") for line in cpu}
-    wanted = [Requirement(line) for line in metadata.get_all("Requires-Dist") or []]
-    assert {r.name.lower() for r in wanted if r.marker is None} <= names
-    pinned = {line.split("==")[0].lower().replace("_", "-"): line.split("==")[1] for line in cpu}
-    for requirement in wanted:
-        if requirement.name.lower() in pinned:
-            assert requirement.specifier.contains(pinned[requirement.name.lower()]), requirement
+def test_the_lock_files_hold_a_hash_of_every_requirement(metadata):
+    pinned: dict[str, str] = {}
+    for file in ("common", "cuda"):
+        for block in re.split(r"\n(?! )", (ROOT / f"requirements/{file}.txt").read_text().strip()):
+            if block.startswith("#"):
+                continue
+            line, *hashes = block.split(" \\\n")
+            assert hashes, line
+            assert all(re.fullmatch(r"  --hash=sha256:[0-9a-f]{64}", one) for one in hashes)
+            requirement = Requirement(line)
+            pinned[canonicalize_name(requirement.name)] = str(requirement.specifier).removeprefix("==")
+    assert locked("cpu", "torch") == f"torch=={pinned['torch']}+cpu"
+    extras = {"lerobot", "openvla", "postgres", "serve", "viewer", "vla-eval", "dev", ""}
+    for requirement in map(Requirement, metadata.get_all("Requires-Dist") or []):
+        if requirement.name != "kerv" and any(
+            requirement.marker is None or requirement.marker.evaluate({"extra": extra}) for extra in extras
+        ):
+            assert requirement.specifier.contains(pinned[canonicalize_name(requirement.name)]), requirement
 
 
 def test_a_failed_installation_is_tried_again(checkout):

@@ -14,6 +14,7 @@ import altair as alt
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from kerv_cli.base.errors import has_rerun
 from kerv_cli.episodes.identity import NOT_DETERMINING, without
 from kerv_cli.lab.store import SWEEP
 from kerv_cli.report.glossary import explanations, with_code
@@ -152,9 +153,11 @@ def _settings(data: StudyData) -> list[dict[str, Any]]:
 def _films(data: StudyData) -> list[dict[str, Any]]:
     """Return for each method a film of its first recorded success and one of its first recorded failure.
 
-    If no episode with an outcome was filmed, there is no film of it. A film is a dictionary with the setting's
-    label, the task, the seed, the outcome, the number of steps and the GIF in base64.
+    If no episode with an outcome was filmed, there is no film of it. Without Rerun there is no film. A film is a
+    dictionary with the setting's label, the task, the seed, the outcome, the number of steps and the GIF in base64.
     """
+    if not has_rerun():
+        return []
     keys = ["label", "task", "seed", "repeat"]
     outcomes = data.episodes.set_index(keys)["success"].to_dict()
     films: dict[tuple[str, bool], dict[str, Any]] = {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from kerv_cli.base.errors import NO_RERUN, KervError, has_rerun
 from kerv_cli.base.files import write_bytes
 from kerv_cli.engine.record import EpisodeRecord
 
@@ -19,8 +20,11 @@ def save_recording(record: EpisodeRecord, path: Path, method: str) -> Path:
         method: Name of the method. Recordings of one method share their layout in the viewer.
 
     Raises:
+        KervError: Rerun is not installed.
         StorageError: The disk is full or read-only, or the folder may not be written to.
     """
+    if not has_rerun():
+        raise KervError(NO_RERUN)
     from kerv_cli.report.viewing.rerun_log import encode
 
     write_bytes(path, encode(record, method))

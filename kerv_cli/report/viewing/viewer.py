@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kerv_cli.base.errors import KervError, UsageError
+from kerv_cli.base.errors import NO_RERUN, KervError, UsageError, has_rerun
 from kerv_cli.base.files import regular
 
 if TYPE_CHECKING:
@@ -121,8 +121,10 @@ def read_chunks(path: Path) -> tuple[RrdReader, list[Chunk]]:
     """Read a recording. Return Rerun's reader and all data chunks of the file.
 
     Raises:
-        KervError: The file is missing, damaged, or holds no recording.
+        KervError: The file is missing, damaged, or holds no recording. Or Rerun is not installed.
     """
+    if not has_rerun():
+        raise KervError(NO_RERUN)
     from rerun.chunk import RrdReader
 
     with warnings.catch_warnings():
