@@ -26,13 +26,18 @@ from kerv_cli.base.errors import KervError, UnknownName, UsageError
 
 PLUGINS = "KERV_PLUGINS"
 
+_COMMANDS = (
+    "demos train prepare build calibrate rollout sweep work serve report runs importing board compare view estimate "
+    "bench doctor"
+)
+
 MODULES: Mapping[str, Sequence[str]] = {
-    "command": (),  # the command line imports its commands itself
+    "command": tuple(f"kerv_cli.cli.{name}" for name in _COMMANDS.split()),
     "environment": ("kerv_cli.worlds",),
     "stress": ("kerv_cli.worlds.stress.kinds",),
     "target": ("kerv_cli.targets",),
 }
-"""The modules that register kerv's own parts of a kind. `kerv_cli.methods` registers the parts of all other kinds."""
+"""The modules that register kerv's own parts of a kind, in order. For all other kinds it is `kerv_cli.methods`."""
 
 METHOD_KINDS = ("prefill_draft", "proposer", "acceptance", "threshold", "rectifier", "boundary", "skip")
 """The parts of a method, in the order in which a decode uses them."""
@@ -365,15 +370,22 @@ def part_of(group: str, name: str) -> Part:
     return find("proposer" if group == "prefill_draft" else group, name, f"{group}.kind")
 
 
-def parts(kind: str) -> Mapping[str, Part]:
+def parts(kind: str, module: str = "") -> Mapping[str, Part]:
     """Return the parts of a kind as a map from name to part, in the order of registration.
 
     `drafter` is a special case. It gives the parts of the kind `artifact` that have settings: only those are trained.
+
+    Args:
+        kind: Kind of part.
+        module: One of kerv's own modules in MODULES. Of these only this one is imported. Empty: all are.
     """
     load_plugins()
     if kind == "drafter":
         return {name: part for name, part in parts("artifact").items() if part.settings is not NoSettings}
-    _load(kind)
+    if module:
+        importlib.import_module(module)
+    else:
+        _load(kind)
     return _PARTS.get(kind, {})
 
 

@@ -1,6 +1,6 @@
 """The `kerv` command with all registered subcommands. Neither torch nor MuJoCo is imported here.
 
-Each of kerv's own commands is in a file of this folder.
+Each of kerv's own commands is in a file of this folder, which is imported when the command is typed.
 """
 
 from __future__ import annotations
@@ -12,14 +12,8 @@ import typer
 from typer.core import TyperGroup
 
 from kerv_cli.base.errors import UnknownName
-from kerv_cli.cli.command import CONTEXT, Command, commands_below, summary_of, typer_command
+from kerv_cli.cli.command import CONTEXT, FastFlags, commands, summary_of, typer_command
 from kerv_cli.cli.common import one_line_errors
-
-# importing a module registers its commands; this is the order in the help
-# isort: off
-from kerv_cli.cli import demos, train, prepare, build, calibrate, rollout, sweep, work, serve, report, runs  # noqa: F401
-from kerv_cli.cli import importing, board, compare, view, estimate, bench, doctor  # noqa: F401
-# isort: on
 
 # Set before numpy loads: by default its matrix multiplications use every core, whatever runtime.threads says.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -32,22 +26,22 @@ FAMILIES = {
 """Help for groups of commands, such as `kerv train`, that do nothing by themselves."""
 
 
-class Commands(TyperGroup):
+class Commands(FastFlags, TyperGroup):
     """A group of registered commands: all of `kerv`, or those whose names begin with `prefix`, such as `train `."""
 
     prefix = ""
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Return the words that can be typed next."""
-        names = (part.name.removeprefix(self.prefix) for part in commands_below(self.prefix))
-        return list(dict.fromkeys(name.split()[0] for name in names))
+        return list(dict.fromkeys(name.removeprefix(self.prefix).split()[0] for name in commands(self.prefix.strip())))
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return the command or the group of commands with this name. None if there is neither."""
         name = self.prefix + cmd_name
-        if name in Command.every():
-            return typer_command(Command.every()[name])
-        if not any(commands_below(f"{name} ")):
+        below = commands(name.split()[0])
+        if name in below:
+            return typer_command(below[name])
+        if not any(one.startswith(f"{name} ") for one in below):
             return None
         family = Commands(name=cmd_name, help=FAMILIES.get(name), no_args_is_help=True, rich_markup_mode=None)
         family.context_settings, family.prefix = CONTEXT, f"{name} "
@@ -60,21 +54,20 @@ class Commands(TyperGroup):
             The command's name, the command, and the arguments after it.
         """
         name = " ".join(args[:2])
-        if self.prefix + name in Command.every():
-            return name, typer_command(Command.every()[self.prefix + name]), args[2:]
+        command = self.get_command(ctx, name) if len(args) > 1 else None
+        if command is not None:
+            return name, command, args[2:]
         command = self.get_command(ctx, args[0])
         if command is None and not ctx.resilient_parsing:
             raise UnknownName(f"{self.prefix}command", args[0], self.list_commands(ctx))
         return args[0], command, args[1:]
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the list of commands to the help, without importing their functions."""
-        rows = []
+        """Write the list of commands to the help."""
+        known, rows = commands(self.prefix.strip()), []
         for word in self.list_commands(ctx):
             name = self.prefix + word
-            rows.append(
-                (word, summary_of(Command.every()[name]) if name in Command.every() else FAMILIES.get(name, ""))
-            )
+            rows.append((word, summary_of(known[name]) if name in known else FAMILIES.get(name, "")))
         with formatter.section("Commands"):
             formatter.write_dl(rows)
 

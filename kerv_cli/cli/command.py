@@ -16,10 +16,10 @@ from __future__ import annotations
 import functools
 import inspect
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import typer
 from typer.core import TyperCommand
@@ -27,7 +27,7 @@ from typer.core import TyperCommand
 from kerv_cli.base.config import compose, groups, plain_text
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.paths import check_writable
-from kerv_cli.base.registry import NoSettings, Part
+from kerv_cli.base.registry import MODULES, NoSettings, Part, parts
 from kerv_cli.base.settings import CommandSettings, choices_of
 from kerv_cli.cli.common import settings_yaml
 
@@ -91,29 +91,37 @@ def top_keys(part: Command) -> list[str]:
     return [key for key in dict.fromkeys([*part.typed, *groups, *names]) if key not in hidden]
 
 
+def commands(words: str = "") -> dict[str, Command]:
+    """Return the commands that begin with some words, by name, in the order of the help.
+
+    Only the file that declares them is imported, so that their help and mistakes are fast.
+
+    Args:
+        words: Words, such as `train`. Empty: all commands.
+    """
+    files, first = MODULES["command"], words.partition(" ")[0]
+    file = f"kerv_cli.cli.{'importing' if first == 'import' else first}"
+    found = parts("command", file if file in files else "")
+    places = {file: place for place, file in enumerate(files)}
+    names = sorted(found, key=lambda name: places.get(found[name].module, len(files)))  # plugins last
+    return {name: cast(Command, found[name]) for name in names if f"{name} ".startswith(f"{words} ".lstrip())}
+
+
 def typer_command(part: Command) -> TyperCommand:
     """Make a typer command from a registered command."""
-    run = part.code
-    parameters = inspect.signature(run, eval_str=True).parameters
-    more = [one.replace(kind=one.KEYWORD_ONLY) for name, one in parameters.items() if name not in _ARGUMENTS]
+    parameters = inspect.signature(part.code, eval_str=True).parameters
+    options = [one.replace(kind=one.KEYWORD_ONLY) for name, one in parameters.items() if name not in _ARGUMENTS]
+    if part.settings is not NoSettings:
+        options.insert(0, inspect.Parameter("cfg", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=_CFG))
 
-    def callback(typed: list[str] | None = None, cfg: bool = False, **options: object) -> None:
-        overrides, names = _split(part, typed or [], "names" in parameters)
-        from kerv_cli.lab.command import chosen_store, noted
+    def declared() -> None:
+        """Only its signature is read: `CommandWithSettings.invoke` calls the command's function."""
 
-        with chosen_store(overrides) as overrides:
-            arguments = {"overrides": overrides, "names": names, "cfg": cfg}
-            if "settings" in parameters or (cfg and "cfg" not in parameters):
-                arguments["settings"] = _settings(part, overrides, cfg)
-            with noted([*part.name.split(), *overrides, *names, *_flags(made, options)]):
-                run(**{name: value for name, value in arguments.items() if name in parameters}, **options)
-
-    cfg_option = [] if part.settings is NoSettings else [_option("cfg", False, _CFG)]
-    options = [_option("typed", None, _typed_argument(part)), *cfg_option, *more]
-    callback.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
+    declared.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     single = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
     help = "\n\n".join(filter(None, (part.help, part.names)))
-    single.command(part.name, cls=CommandWithSettings, help=help, context_settings=CONTEXT)(callback)
+    words = {**CONTEXT, "allow_extra_args": True}  # typer's own argument for them would import pydantic
+    single.command(part.name, cls=CommandWithSettings, help=help, context_settings=words)(declared)
     made: Any = typer.main.get_command(single)
     made.part = part
     return made
@@ -136,30 +144,23 @@ _ARGUMENTS = ("settings", "overrides", "names", "cfg")
 _CFG = Annotated[bool, typer.Option("--cfg", help="Print the resolved settings and stop.")]
 
 
-def _option(name: str, default: object, annotation: object) -> inspect.Parameter:
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-
-
-def _typed_argument(part: Command) -> object:
-    """Return the type annotation of the one argument that takes all words except options. The help does not list it."""
-    metavar = "NAME" if part.names else "KEY=VALUE"
-    argument = typer.Argument(metavar=metavar, hidden=True, autocompletion=complete)
-    return Annotated[list[str] | None, argument]
-
-
-def complete(ctx: typer.Context, incomplete: str) -> list[str]:
+def complete(part: Command, typed: Sequence[str], incomplete: str) -> list[str]:
     """Complete an override in the shell: `me` becomes `method=`, and `method=s` every method that begins with s.
 
     bash passes `method`, `=` and `s` as three words, other shells pass one.
+
+    Args:
+        part: The command.
+        typed: The words before.
+        incomplete: The beginning of the word.
     """
-    part = Command.find(" ".join(ctx.command_path.split()[1:]))
-    keys, before = top_keys(part), [word for word in ctx.params.get("typed") or () if word != "="]
+    keys, before = top_keys(part), [word for word in typed if word != "="]
     if before and before[-1] in keys:
         return [name for name in _values(part, before[-1]) if name.startswith(incomplete)]
-    key, equals, typed = incomplete.partition("=")
+    key, equals, value = incomplete.partition("=")
     if not equals:
         return [f"{name}=" for name in keys if name.startswith(incomplete)]
-    return [f"{key}={name}" for name in _values(part, key) if name.startswith(typed)]
+    return [f"{key}={name}" for name in _values(part, key) if name.startswith(value)]
 
 
 def _values(part: Command, key: str) -> list[str]:
@@ -229,15 +230,54 @@ def _settings(part: Command, overrides: list[str], cfg: bool) -> Any:
     return settings
 
 
-class CommandWithSettings(TyperCommand):
+class FastFlags:
+    """Makes a flag that is not typed False instead of None. Typer would import pydantic to convert None."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the options of the command."""
+        params: list[Any] = super().get_params(ctx)  # type: ignore[misc]
+        for one in params:
+            if one.type_descriptor.annotation is bool and one.default is None:
+                one.default = False
+        return params
+
+
+class CommandWithSettings(FastFlags, TyperCommand):
     """A typer command whose help also lists settings, subcommands and examples."""
 
     part: Command
 
+    def invoke(self, ctx: Any) -> None:
+        """Run the command with the settings, names and options that were typed."""
+        from kerv_cli.lab.command import chosen_store, noted
+
+        part, options = self.part, dict(ctx.params)
+        cfg, wanted = options.pop("cfg", False), inspect.signature(part.code).parameters
+        overrides, names = _split(part, ctx.args, "names" in wanted)
+        with chosen_store(overrides) as overrides:
+            arguments = {"overrides": overrides, "names": names, "cfg": cfg}
+            if "settings" in wanted or (cfg and "cfg" not in wanted):
+                arguments["settings"] = _settings(part, overrides, cfg)
+            given = {name: value for name, value in arguments.items() if name in wanted}
+            with noted([*part.name.split(), *overrides, *names, *_flags(self, options)]):
+                part.code(**given, **options)
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
+        """Complete an option or an override."""
+        if incomplete.startswith("-"):
+            return super().shell_complete(ctx, incomplete)
+        from typer._click.shell_completion import CompletionItem
+
+        return [CompletionItem(word) for word in complete(self.part, ctx.args, incomplete)]
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """Return the words of the help's first line."""
+        return [*super().collect_usage_pieces(ctx), "[NAME]..." if self.part.names else "[KEY=VALUE]..."]
+
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
         """Add the most used settings, the subcommands and the examples to the help."""
         keys = [_row(self.part, key) for key in self.part.shown]
-        below = list(commands_below(f"{self.part.name} "))
+        below = [part for name, part in commands(self.part.name).items() if name != self.part.name]
         if keys:
             with formatter.section(f"Settings, with their defaults (all of them: kerv {self.part.name} --cfg)"):
                 formatter.write_dl(keys)
@@ -288,8 +328,3 @@ def _type_name(at: Field[Any]) -> str:
         return " | ".join(at.metadata["names"])
     plain = str(at.type).removesuffix(" | None").split("[")[0]
     return {"str": "text", "bool": "true or false", "dict": "mapping", "float": "number"}.get(plain, plain)
-
-
-def commands_below(prefix: str) -> Iterator[Command]:
-    """Yield the commands whose names begin with `prefix`, such as `train `, in the order of registration."""
-    return (part for name, part in Command.every().items() if name.startswith(prefix))

@@ -188,6 +188,8 @@ def with_results(message: str, words: Iterable[str]) -> str:
     from kerv_cli.base.registry import parts
 
     where = results_word(words)
+    if not where:
+        return message
 
     def complete(found: re.Match[str]) -> str:
         quote, command = found.groups()

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import typer
 
 from kerv_cli.base.errors import Interrupted
-from kerv_cli.cli.command import Command, command, typer_command
+from kerv_cli.cli.command import command, commands, typer_command
 from kerv_cli.cli.common import ShowPlan, print_table, results_word
 from kerv_cli.training.settings import PrepareSettings
 
@@ -92,9 +92,10 @@ def run(line: Sequence[str]) -> None:
         Interrupted: The user pressed Ctrl-C.
         typer.Exit: The command failed, and has printed the reason.
     """
-    name = max((name for name in Command.every() if " ".join(line).startswith(f"{name} ")), key=len)
+    known = commands(line[0])
+    name = max((name for name in known if " ".join(line).startswith(f"{name} ")), key=len)
     try:
-        code = typer_command(Command.every()[name]).main(list(line[len(name.split()) :]), standalone_mode=False)
+        code = typer_command(known[name]).main(list(line[len(name.split()) :]), standalone_mode=False)
     except typer.Abort:  # typer's exception for Ctrl-C
         raise Interrupted("interrupted: what is made is kept, the same command goes on there") from None
     if code:
