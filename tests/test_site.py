@@ -1,5 +1,6 @@
 """The pages as a site: links, the reference of commands, and figures that are those of the committed tables."""
 
+import ast
 import re
 import subprocess
 import sys
@@ -47,6 +48,21 @@ def test_every_link_leads_to_a_file_and_a_heading(source):
         assert file.is_file(), f"{source}: {target}"
         if anchor and file.suffix == ".md":
             assert anchor in anchors(str(file.relative_to(ROOT))), f"{source}: {target}"
+
+
+def test_the_layout_names_every_module_and_its_walks_name_functions_that_exist(docs):
+    text = (ROOT / "docs/layout.md").read_text(encoding="utf-8")
+    modules, written = (re.findall(r"^(?:- `|\*\*)\S+", one, re.MULTILINE) for one in (text, docs.with_modules(text)))
+    assert modules == written, "run `make pages`"
+    assert len(modules) > len([*(ROOT / "kerv_cli").rglob("*.py")])
+    links = re.findall(r"\[`([\w.]+)`\]\(\.\./(kerv_cli/[\w/]+\.py)\)", text)
+    assert len(links) > 30
+    for name, path in links:
+        body = ast.parse((ROOT / path).read_text(encoding="utf-8")).body
+        for word in name.split("."):
+            found = [one for one in body if getattr(one, "name", "") == word]
+            assert found, f"docs/layout.md: {path} has no {name}"
+            body = found[0].body
 
 
 def test_the_site_lists_every_page(docs):
