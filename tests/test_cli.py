@@ -22,6 +22,7 @@ from kerv_cli.base.registry import NoSettings, parts
 from kerv_cli.cli.command import Command
 from kerv_cli.cli.common import one_line_errors
 
+INVOKE = "from typer.testing import CliRunner; from kerv_cli.cli.app import app; CliRunner().invoke(app, "
 FAST = ["episodes=2", "world.horizon=8", "record=0"]
 
 
@@ -30,9 +31,12 @@ FAST = ["episodes=2", "world.horizon=8", "record=0"]
     [
         ("import kerv_cli", "torch numpy pandas mujoco typer"),
         ("import kerv_cli.cli.app", "torch mujoco hydra pandas rerun"),
-        ("import kerv_cli.api, kerv_cli.board.app, kerv_cli.report.page", "rerun"),
+        ("import kerv_cli.board.app, kerv_cli.report.page", "rerun"),
         ("from kerv_cli.base.registry import parts; parts('proposer')", "torch mujoco numpy pyarrow hydra pydantic"),
         ("from kerv_cli.worlds import task_names; list(task_names())", "torch mujoco metaworld numpy hydra pydantic"),
+        (f"{INVOKE}['train', 'drafter', '--help'])", "torch numpy hydra pydantic"),
+        (f"{INVOKE}['rollout', 'nonsense.key=1'])", "torch numpy pydantic"),
+        (f"{INVOKE}['sweep', 'study=demo', 'nonsense.key=1'])", "torch numpy pydantic"),
         (
             "from kerv_cli.worlds.vla_eval import MetaWorld as M; M(tasks=['MT10'], stress='push').get_tasks()",
             "torch mujoco metaworld",

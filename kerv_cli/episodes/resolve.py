@@ -16,7 +16,6 @@ from kerv_cli.base.registry import METHOD_KINDS
 from kerv_cli.episodes.identity import flat, without_effect
 from kerv_cli.episodes.settings import DEFAULT_TASKS, RolloutSettings, StudySettings, SweepSettings
 from kerv_cli.methods.settings import EXPERT
-from kerv_cli.targets.checkpoint import TargetDescription, described
 from kerv_cli.targets.folders import find_target
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
 
@@ -272,6 +271,8 @@ def trained_tasks(settings: RolloutSettings) -> tuple[str, ...]:
         folder = find_target(settings.results, settings.policy.target)
     except UsageError:
         return ()
+    from kerv_cli.targets.checkpoint import TargetDescription, described  # imports numpy
+
     names = described(folder, "target", TargetDescription).tasks
     return resolve_tasks(names) if names else ()
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 from kerv_cli.base import registry
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import check_settings
-from kerv_cli.engine.chunk import chunk_steps
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.parallel import check_parallel, is_parallel
 from kerv_cli.methods.settings import MethodSettings
@@ -83,6 +82,8 @@ class Method:
             UnknownName: The settings name a part that does not exist.
             UsageError: The parts cannot work together or with the target, or a number is out of range.
         """
+        from kerv_cli.engine.chunk import chunk_steps  # imports numpy, which a mistyped key must not wait for
+
         for kind in self.parts:
             check_settings(self.settings[kind], kind)
         chunk_steps(self.chunk, target.chunk)
