@@ -76,7 +76,7 @@ def schemas_of(part: Command) -> list[type]:
 
     The first one is the command's own. The second one belongs to the command that `each` names, if there is one.
     """
-    others = [Command.find(part.each)] if part.each else []
+    others = [commands(part.each)[part.each]] if part.each else []
     return [one.settings for one in (part, *others)]
 
 
@@ -237,7 +237,7 @@ class FastFlags:
         """Return the options of the command."""
         params: list[Any] = super().get_params(ctx)  # type: ignore[misc]
         for one in params:
-            if one.type_descriptor.annotation is bool and one.default is None:
+            if getattr(one, "is_flag", False) and one.default is None:
                 one.default = False
         return params
 
