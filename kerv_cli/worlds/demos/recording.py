@@ -293,6 +293,7 @@ def _run_jobs(
     pool = Workers(min(config.workers, len(jobs)))
     try:
         work = [pool.submit(_record_seeds, config, out, task, seeds, make_actor) for task, seeds in jobs]
+        pool.submit(int)  # wakes the pool's thread, which may not watch the process that was started last
         for done in as_completed(work):
             yield done.result()
     except BrokenProcessPool as error:
