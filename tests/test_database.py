@@ -383,7 +383,7 @@ def test_a_locked_file_says_what_else_to_use(tmp_path, monkeypatch):
     other.close()
 
 
-def test_a_full_disk_keeps_what_was_committed(tmp_path):
+def test_a_full_disk_keeps_what_was_committed(tmp_path, monkeypatch):
     """A limit on the size of files stands for the disk."""
     study = threshold_study(["reach-v3", "push-v3"], episodes=5)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -404,6 +404,7 @@ def test_a_full_disk_keeps_what_was_committed(tmp_path):
     store = Study(opened(tmp_path), "threshold")
     assert store.counts() == (8, 40)
     assert len(store.frame()) == 8
+    monkeypatch.setattr("kerv_cli.lab.queue.LAPSE_SECONDS", 1.0)
     swept(tmp_path, study)  # in this process, whose claim could not be released
     assert store.counts() == (40, 40)
 
