@@ -49,9 +49,7 @@ def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Beg
             training.
         KervError: See `fit`.
     """
-    drafter: TrainableDrafter = find("drafter", settings.drafter.kind, "drafter.kind").built()
-    train = settings.train
-    refuse_unused(train, OF_TARGETS, ": only the training of a target has this setting")
+    drafter, train = drafter_of(settings), settings.train
     artifacts = Artifacts(settings.results, settings.policy)
     folder, description = artifacts.new(drafter.kind), artifacts.description
     description.check_autoregressive(
@@ -98,6 +96,19 @@ def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Beg
 
         with stage("training the drafter") as progress:
             return folder, fit(network, loss, validate, save, train, folder, identity, progress)
+
+
+def drafter_of(settings: TrainDrafterSettings) -> TrainableDrafter:
+    """Return the kind of drafter to train.
+
+    Raises:
+        UnknownName: The kind does not exist.
+        UsageError: A setting belongs to another kind of drafter, or only to the training of targets.
+    """
+    part = find("drafter", settings.drafter.kind, "drafter.kind")
+    refuse_unused(settings.train, OF_TARGETS, ": only the training of a target has this setting")
+    drafter: TrainableDrafter = part.built()
+    return drafter
 
 
 def import_drafter(settings: BuildDrafterSettings) -> tuple[Path, dict[str, Any]]:
