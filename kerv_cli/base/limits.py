@@ -24,7 +24,8 @@ def setting(default: Any, help: str = "", **metadata: Any) -> Any:
     Args:
         default: The default value, or a function (such as a dataclass) that makes it.
         help: Description for `--help` and `--cfg`, one line.
-        **metadata: Entries of the field's metadata: `limits`, `names` (allowed values) or `group` (of conf/).
+        **metadata: Further facts about the field. `limits`: result of the function `limits`. `names`: the allowed
+            values. `group`: for a field that is named like a folder of conf/, the file that is chosen by default.
     """
     metadata |= {"help": help} if help else {}
     if callable(default):

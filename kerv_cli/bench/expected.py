@@ -133,9 +133,10 @@ class Decodes:
         return _least(lambda chance: self.verified([chance]).forwards <= forwards)
 
     def break_even(self) -> Means | None:
-        """Return the means of a verified decode that takes as long as an autoregressive decode.
+        """Return the mean costs and counts of a verified decode that takes as long as an autoregressive one.
 
-        This needs a certain probability of acceptance. Returns None if even the probability 1 is not enough.
+        They are computed at the acceptance probability at which both take the same time. Returns None if the verified
+        decode is slower even at probability 1.
         """
         limit = self.profile.decode(self.tokens)
         if self.verified([1.0]).seconds > limit:
@@ -144,7 +145,7 @@ class Decodes:
 
     @functools.cached_property
     def _cost(self) -> Callable[[str, int], float]:
-        """`Profile.seconds`, which a search asks for again and again."""
+        """`Profile.seconds`, whose results are kept, because a search asks for the same ones many times."""
         return functools.cache(self.profile.seconds)
 
     @property

@@ -159,7 +159,8 @@ class Sizes:
         cached: Numbers in the key/value cache per token.
         weight: Bytes of a weight, on average.
         slot: Bytes of a number in the key/value cache.
-        padding: Number of tokens that a prefill computes beyond the prompt. 0 except for grown targets.
+        padding: Number of tokens that a prefill computes beyond the prompt. 0 except for grown targets, which are
+            enlarged with untrained weights and a longer prompt to cost as much as a larger model.
         drafter_padding: Number of tokens that the drafter computes beyond the prompt, when it reads the prompt's hidden
             states.
     """
@@ -212,7 +213,7 @@ class Sizes:
         channel of each key that a token attends to.
 
         Args:
-            rows: Number of tokens in the forward. A grown target adds its padding to a prefill.
+            rows: Number of tokens in the forward, without `padding`. This method adds `padding` to a prefill.
             cached: Number of earlier tokens in the cache. 0: a prefill.
         """
         rows += 0 if cached else self.padding

@@ -88,12 +88,12 @@ def choose_length(trace: Sequence[TracedDecode], costs: NamedProfile) -> list[di
     """Compute how fast drafted chains of each length would have been, for each setting that drafts chains.
 
     The probability that the i-th draft token is accepted is measured on the recorded drafts that had an i-th token and
-    whose earlier tokens were all accepted. Chains inside a prefill do not count.
+    whose earlier tokens were all accepted. Chains that were verified in the same forward as the prompt do not count.
 
     Returns:
-        One dictionary for each setting and chunk length. It holds the fastest length of chains, the share of resamples
-        of the episodes in which that length is the fastest, and the speed against AR of each length from 0 (AR) to the
-        longest recorded one.
+        One dictionary for each setting and chunk length. Its `best` is the fastest length of chains. Its `speeds` are
+        the speeds against AR, for each length from 0 (AR) to the longest recorded one. `sure` tells how certain `best`
+        is: the episodes are resampled many times, and `sure` is the share of resamples in which `best` is the fastest.
 
     Raises:
         UsageError: The trace has no chain, or the profile lacks a cost.

@@ -158,7 +158,7 @@ class Work:
 
     @property
     def needs(self) -> list[str]:
-        """Kinds of costs that a profile needs to price this work."""
+        """Kinds of costs that a profile must contain for the seconds of this work to be computed from it."""
         return [*self.calls, *self.sources]
 
 

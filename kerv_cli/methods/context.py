@@ -15,13 +15,13 @@ from kerv_cli.base.errors import UsageError
 
 @dataclass(frozen=True)
 class Context:
-    """What a part is built from, besides its own settings.
+    """What a part of a method (a proposer, skip rule, threshold, …) is built from, besides its own settings.
 
     Attributes:
         target: A `Target`. Some parts need a `ReadableTarget` (`engine/protocol.py`).
         artifact: Returns the loaded artifact of a kind, such as `drafter`.
         task: Full name of the task. Empty: unknown.
-        built: The parts of the method that are built already, by kind.
+        built: The method's parts that are built already, by kind such as `proposer`.
         method: Settings of all parts of the method, by kind.
         chunk: Number of control steps per chunk. 0: as many as the target was trained for.
     """

@@ -140,7 +140,10 @@ class Trial:
         return [self.drafted[i] for i in TREE.tree.path_to(node)]
 
     def causality(self) -> Pairs:
-        """Check that a token's hidden state does not depend on later tokens."""
+        """Check that a token's hidden state does not depend on later tokens.
+
+        Yields hidden states from a forward of four tokens, and those of the same tokens in a forward of all tokens.
+        """
         yield self.plain(self.tokens[:4]), self.plain(self.tokens)[:, : self.length + 4]
 
     def pieces(self) -> Pairs:
@@ -166,8 +169,9 @@ class Trial:
     def draft_tree(self) -> Pairs:
         """Check that a node of a draft tree has the same hidden state as in a forward of only its own path.
 
-        The tree is forwarded twice: after cached tokens, and together with the prompt, as with a draft before the
-        prefill.
+        The whole tree is forwarded twice. First it follows cached tokens, as in a later round of a decode. Then it
+        follows the prompt in one forward, as when the prefill verifies a draft. For each node, a pair of each case
+        holds the node's hidden state in the tree, and that in a forward of its path alone.
         """
         after = self.forward_tree()[1][:, 1:]
         positions, cache = TREE.positions(0, self.length, self.prompt.device), self.new_cache()

@@ -58,8 +58,8 @@ class BoundaryRanges:
         length_low: Minimum of D.
         length_high: 95th percentile of D.
         points: R and D of a hundred windows of the paths, both scaled to [0, 1]. All windows were sorted by R + D, and
-            evenly spaced ones were taken. Quantiles of F are computed from them. Empty in calibrations before version
-            1.1.
+            evenly spaced ones were taken. They give the quantiles of F, the weighted sum of the scaled R and D. Empty
+            in calibrations before version 1.1.
 
     Raises:
         CheckpointError: A range is empty or not finite.

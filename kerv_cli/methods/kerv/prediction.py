@@ -231,9 +231,9 @@ class Damped(Kalman):
 class Walk(Predictor):
     """The filter of KERV's public code: a random walk per DoF, on token ids, with Q = 1 and R = 1e-3.
 
-    It is a Kalman filter whose state is the action alone. Its gain is 0.999, so it nearly repeats the last action. It
-    begins at the first action with the variance R. Token ids differ from normalised values by a scale and an offset,
-    which change no weight.
+    It is a Kalman filter whose state is the action alone. Its gain is 0.999, so it nearly repeats the last action. The
+    first action is its first state, with the variance R. A token id is a normalised value times a scale plus an offset.
+    So the filter has the same weights for both.
     """
 
     name = "walk"

@@ -312,10 +312,13 @@ def sum_of_exponentials(x, most):
 
 @compiled
 def choose(frame, columns, numbers):
-    """Choose the tokens of a chunk, and estimate the probability that all are accepted, see `early.drafter.choose`.
+    """Choose the tokens of a chunk, and estimate the probability that all are accepted, like `early.drafter.choose`.
 
-    `elementwise` explains the arguments. The operation's constants in `numbers` are one per token: 1 if the token must
-    equal the target's, else 0.
+    Args:
+        frame: (size,) float32, the memory of one row of the batch. It holds the logits, and afterwards the result.
+        columns: The operation's line in the table of operations, see `recording.COLUMNS`.
+        numbers: Constants of all operations. This operation has one per token: 1 if the token must equal the target's,
+            else 0.
     """
     out, a, rows, width, stride, first = columns[1], columns[2], columns[4], columns[5], columns[6], columns[7]
     radius, odds = int(frame[columns[3]]), _ONE

@@ -186,7 +186,14 @@ class LayerStack(Compilable):
         return x.is_cuda and x.shape[0] == 1 and not wants_gradient(x)
 
     def recorded(self, *inputs: Tensor) -> Tensor:
-        """Record how hidden states are computed. Inputs and result are `Recorded`, stand-ins for tensors (1, 1, E)."""
+        """Record the operations of all layers on one token, to compile them. Nothing is computed.
+
+        Args:
+            *inputs: Stand-ins (`Recorded`) for the input tensors (1, 1, E). Their tape stores the operations.
+
+        Returns:
+            The stand-in for the hidden state (1, 1, E).
+        """
         return self.finish(self.run_layers(self.begin(*inputs), slice(None), None, None, None))
 
     def run_layers(
