@@ -244,7 +244,10 @@ class Database:
 
     @property
     def words(self) -> list[str]:
-        """The overrides that choose this database, for commands that are printed. Empty for the folder `results`."""
+        """Overrides that choose this database. They end the commands that a message or page tells the user to run.
+
+        Empty for the SQLite file in the folder `results`.
+        """
         folder = [] if self.results == results_dir("results") else [f"results={self.results}"]
         return folder + ([f"store={self.shown}"] if self.store else [])
 
@@ -280,7 +283,8 @@ class Database:
     def kept_open(self) -> Iterator[None]:
         """Keep a SQLite file open during the `with` block, so that its transactions are quick.
 
-        Each time nobody has it open any more, SQLite moves its log into the file and flushes both to the disk.
+        When the last connection to the file is closed, SQLite moves its log into the file and flushes both to the disk.
+        That is slow.
         """
         with self.reading() if self.file else contextlib.nullcontext():
             yield
@@ -326,7 +330,7 @@ class Database:
 
     @contextlib.contextmanager
     def checking(self, what: str) -> Iterator[None]:
-        """Report an error in the `with` block, which converts stored values, as damage of the database.
+        """Convert stored values in a `with` block. An error in the block is reported as damage of the database.
 
         Args:
             what: What is converted, for the message.

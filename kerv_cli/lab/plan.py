@@ -52,9 +52,9 @@ class Setting:
 
     Attributes:
         label: The setting's name in the study.
-        overrides: The overrides that make it, as the user wrote them.
+        overrides: The overrides from which the setting is composed, as the user wrote them.
         settings: The rollout's settings as nested plain values, without the task.
-        identity: Hashes of the weights and data that it reads.
+        identity: Hashes of the weights and data that the setting reads.
         varies: This setting's values of the keys that differ within its grid, by key. A grid is the settings that one
             entry of the study expands into, because an override has several values.
         name: Name of the grid. Empty: the label.
@@ -208,9 +208,10 @@ class Block:
         return f"{label} from {self.name} on: {count(len(self.episodes), 'episode')}, {self.batch} at a time"
 
     def turns(self) -> Iterator[Episode]:
-        """Yield the episodes seed by seed. For each seed the settings' order is random but reproducible.
+        """Yield the episodes in the order in which they run.
 
-        The episodes of a batch keep their order.
+        They run seed by seed. For each seed the settings' order is random but reproducible. In a block that runs as a
+        batch, the order is that of `episodes`.
         """
         import numpy as np
 
@@ -235,7 +236,7 @@ def split(
 
     Args:
         episodes: The study's episodes.
-        block: Number of seeds that the study keeps together.
+        block: Number of seeds in a block, which one process runs.
         stored: Episodes in the database, by `Episode.key`.
         rerun: Which existing episodes to run again: none (NEVER), those that did not take turns in one block (TIMED),
             those that other code ran (CHANGED), or all (ALL).
@@ -244,7 +245,7 @@ def split(
         earlier: The newest stored setting and its hash, by label. Used to explain what has changed.
 
     Returns:
-        Existing episodes with their rows, and missing episodes with the reason for running them.
+        Two mappings: from each existing episode to its row, and from each missing episode to the reason for running it.
     """
     from kerv_cli.episodes.identity import code_hash
 
@@ -373,7 +374,7 @@ def blocks_of(episodes: Iterable[Episode], block: int, workers: int = 1) -> list
 
     Args:
         episodes: The episodes to run.
-        block: Number of seeds that the study keeps together.
+        block: Largest number of seeds in a block.
         workers: Number of processes.
     """
     by_way = grouped(episodes, lambda one: batch_of(one.setting.settings) > 1)

@@ -59,7 +59,7 @@ class Preparing:
 
 @dataclass(frozen=True)
 class BlocksWait:
-    """Other processes run all blocks that are left. The worker waits, to take over those of a process that dies."""
+    """Other processes run all blocks that are left. The worker waits: if a process dies, its block is free again."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class EpisodeEnd:
         episode: The episode.
         success: Whether the task was solved.
         seconds: Wall time.
-        elsewhere: Whether another command has planned it.
+        elsewhere: Whether another command than this one planned the episode.
     """
 
     episode: Episode
@@ -98,7 +98,9 @@ class SettingFailed:
 
 @dataclass
 class Outcome:
-    """Result of `study.run`. Each episode of the study is in exactly one of the three lists, unless it was detached.
+    """Result of `study.run`. Each episode of the study is in exactly one of the first three lists.
+
+    If workers of a cluster go on without this command (`detached`), the missing episodes are in none.
 
     Attributes:
         done: Episodes that this command planned and that were run.
@@ -242,7 +244,7 @@ class TimeLeft:
 
     @property
     def seconds(self) -> float:
-        """Seconds that the episodes still take that have neither ended nor failed."""
+        """Estimated seconds until every planned episode has ended or failed."""
         means = self._stored | {work: self._measured[work] / number for work, number in self._ended.items()}
         mean = sum(means.values()) / len(means) if means else self._guess
         return sum(number * means.get(work, mean) for work, number in self._waiting.items()) / self.workers

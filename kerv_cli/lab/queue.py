@@ -30,9 +30,9 @@ T = TypeVar("T")
 BEAT_SECONDS = 5.0
 """Seconds between two heartbeats of a claim."""
 LAPSE_SECONDS = 30.0
-"""A claim without a heartbeat for so long is free again."""
+"""Seconds without a heartbeat after which other workers may claim the block."""
 PATIENCE_SECONDS = 120.0
-"""Time for which a worker tries to reach a database that does not answer."""
+"""Seconds for which a worker tries to reach a database that does not answer."""
 
 
 class ClaimLost(KervError):
@@ -44,16 +44,17 @@ def worker_id(pid: int, more: str = "") -> str:
 
     Args:
         pid: Its process id.
-        more: Tells workers of one process apart. Without it, the result is the beginning of its workers' names.
+        more: Tells the workers of one process apart. Empty: the result is the prefix that all their names share.
     """
     return f"{socket.gethostname()}:{pid}:{more}"
 
 
 def patiently(action: Callable[[], T]) -> T:
-    """Do something with the database. While it does not answer, try again for PATIENCE_SECONDS.
+    """Call a function that uses the database. While the database does not answer, call it again.
 
     Raises:
-        StorageError: It did not answer for that long, or trying again would not help, as when the disk is full.
+        StorageError: The database did not answer for PATIENCE_SECONDS. Or calling again would not help, for example
+            because the disk is full.
     """
     deadline = time.monotonic() + PATIENCE_SECONDS
     while True:
@@ -73,7 +74,7 @@ def enqueue(study: Study, run: str) -> None:
 
     Args:
         study: The study with its plan.
-        run: Id of the command that made it.
+        run: Id of the command that made the plan.
     """
     about = {"executor": study.runtime.executor, "workers": study.runtime.workers}
     with study.database.writing() as connection:
@@ -133,7 +134,7 @@ class Queue:
         A block is not free while another worker runs one of its episodes, for whichever study.
 
         Args:
-            ended: The worker's block before, which has ended and is removed from the queue.
+            ended: The block that this worker has just finished. It is removed from the queue. None: there is none.
         """
         with self.database.writing() as connection:
             if ended is not None:
@@ -221,8 +222,8 @@ class Queue:
         Args:
             connection: The database, in a transaction.
             claim: The block.
-            running: The episode that begins now. None: as before.
-            **values: Further columns to write.
+            running: The episode that begins now. None: keep the stored one.
+            **values: Further columns of the block's row to write.
 
         Raises:
             ClaimLost: The block does not belong to this worker any more.
@@ -240,7 +241,7 @@ class Queue:
 
     @contextlib.contextmanager
     def beating(self) -> Iterator[None]:
-        """Write the heartbeat of the claimed block until the end of the `with` block. Then free what is claimed."""
+        """Write the heartbeat of the claimed block during the `with` statement. At its end, free that block."""
         ended = threading.Event()
 
         def beat() -> None:
@@ -268,7 +269,7 @@ class Queue:
     def left(self) -> tuple[int, int]:
         """Return how many blocks have not ended, and how many of them nobody has claimed.
 
-        A worker that only looks holds up nobody.
+        This only reads the database, so no worker has to wait for it.
         """
         with self.database.reading() as connection:
             is_open = sa.case((self._is_open(connection), 1), else_=0)
@@ -277,13 +278,13 @@ class Queue:
         return int(waiting), int(free)
 
     def claimed(self) -> list[tuple[int, str]]:
-        """Return the blocks that are running: the place of each in its plan, and the worker that runs it."""
+        """Return, for each block that is running, its index in the plan and the name of the worker that runs it."""
         query = sa.select(QUEUE.c.position, QUEUE.c.worker).where(self._mine(), QUEUE.c.worker.is_not(None))
         with self.database.reading() as connection:
             return [(position, worker) for position, worker in connection.execute(query)]
 
     def lapse(self, pid: int) -> bool:
-        """Let the claims of a process of this machine that has died lapse at once. Return whether it had any."""
+        """Free at once the blocks that a dead process of this machine had claimed. Return whether there were any."""
         with self.database.writing() as connection:
             died = QUEUE.c.worker.startswith(worker_id(pid), autoescape=True)
             return bool(connection.execute(sa.update(QUEUE).where(died).values(heartbeat=0.0)).rowcount)

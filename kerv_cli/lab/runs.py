@@ -33,7 +33,7 @@ RUNNING, COMPLETE, FAILED, INTERRUPTED = "running", "complete", "failed", "inter
 BEAT_SECONDS = 5.0
 """Seconds between two heartbeats of a run."""
 LOADING_SECONDS = 5.0
-"""Guess of the seconds that a command takes to load libraries and the simulator. They do not grow with its work."""
+"""Guess of the seconds that every command takes to load libraries and the simulator, whatever its amount of work."""
 STALE_SECONDS = 900.0
 """A run on another machine counts as dead after this many seconds without a heartbeat."""
 
@@ -302,10 +302,10 @@ def command_to_go_on(database: Database, kind: str, folder: Path) -> tuple[str, 
 
 
 def interrupted(database: Database, kind: str, command: Sequence[str], name: str | None = None) -> RunRow | None:
-    """Return the first row of a command that was interrupted, perhaps several times, and did not complete since.
+    """Return the oldest row of a command that was interrupted, perhaps several times, and did not complete since.
 
-    None if its newest row is complete, if another command has made the same study or artifact since, or if there is no
-    row.
+    Returns None if the command has no row or its newest row is complete. Also returns None if another command has made
+    the same study or artifact since.
 
     Args:
         database: The database.

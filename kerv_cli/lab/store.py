@@ -225,8 +225,9 @@ class Study:
         """Compare the episodes with the database. Return the study with its existing and missing episodes.
 
         Args:
-            rerun: Which existing episodes to run again, as in `plan.split`.
-            since: Start of the interrupted command that is resumed, as in `plan.split`. Empty: none.
+            rerun: Which existing episodes to run again: NEVER, TIMED, CHANGED or ALL (`lab/plan.py`).
+            since: Used only with ALL, if an interrupted command is resumed: the time at which it began (ISO 8601). Empty:
+                all episodes run again.
             runtime: Executor, workers and device.
             command: Command-line arguments (without `kerv`) that resume the study.
         """
@@ -274,11 +275,11 @@ class Study:
             return {row.label: (setting_of(row), row.work) for row in rows}
 
     def save(self) -> None:
-        """Write the study's settings and episodes.
+        """Write the study's settings and its list of planned episodes.
 
-        If the study is stored already, its unchanged settings keep their episodes of other tasks. Stored episodes with
-        a seed or repeat outside this study's ranges are removed from it. So sweeps of one study over different tasks
-        give one report.
+        If the study is stored already, its settings may list episodes of tasks that are not in this plan. They stay in
+        the list if their setting and the baseline are unchanged, and their seeds and repeats are within this plan's. So
+        sweeps of one study over different tasks give one report.
         """
         with self.database.writing() as connection:
             self.save_in(connection)
@@ -438,8 +439,8 @@ class Study:
             connection: The database, in a transaction.
             one: The episode.
             block: Row of its block.
-            row: Columns of the table `episodes`, as far as they are not in the two before.
-            decodes: Its decodes, a Parquet file.
+            row: Columns of the table `episodes` whose values are neither in `one` nor in `block`.
+            decodes: The episode's decodes, as the bytes of a Parquet file.
         """
         work, task, seed, repeat = one.key
         key = {"work": work, "task": task, "seed": seed, "repeat": repeat, "block": block["id"]}
@@ -465,8 +466,8 @@ class Study:
     def remove(self) -> None:
         """Delete the study, and its episodes that no other study uses.
 
-        Its episodes are those that it uses, and those that its own commands ran, such as the ones that `rerun=all`
-        replaced.
+        Episodes that its commands ran but that it does not use any more, because `rerun=all` replaced them, are deleted
+        too.
         """
         used = sa.select(WANTED.c.episode_id).select_from(PLANNED)
         used = used.where(WANTED.c.episode_id.is_not(None))
@@ -514,7 +515,7 @@ def setting_of(row: Any) -> Setting:
     """Return the setting that a row of the table `settings` describes.
 
     Raises:
-        Damaged: It names no method, or what identifies its weights is no text.
+        Damaged: The row names no method, or a hash of weights or data in it is not text.
     """
     texts = [row.settings.get("method"), *row.identity.values()]
     if not all(isinstance(text, str) for text in texts):

@@ -40,7 +40,7 @@ class EpisodeRunner:
 
     Attributes:
         rollouts: Folder for recordings, one .rrd file per recorded episode.
-        save: Writes a recording.
+        save: Writes the recording of an episode.
     """
 
     rollouts: Path
@@ -75,7 +75,7 @@ def study_of(resolved: ResolvedStudy, database: Database, kind: str = SWEEP) -> 
 
     Args:
         resolved: The study with all its settings.
-        database: Where its results are.
+        database: The database that has or gets the study's results.
         kind: SWEEP or ROLLOUT.
 
     Raises:
@@ -136,7 +136,7 @@ def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], ki
     Args:
         resolved: The study with all its settings.
         database: The database.
-        command: Command-line arguments (without `kerv`) that resume it.
+        command: Command-line arguments (without `kerv`) that resume the sweep or rollout.
         kind: SWEEP or ROLLOUT.
 
     Raises:
@@ -173,7 +173,7 @@ def run(study: Study, on_event: OnEvent = lambda event: None, *, save: Save = la
     Args:
         study: The study with its plan.
         on_event: Called with each event, to show progress.
-        save: Writes a recording. The default writes nothing.
+        save: Writes the recording (.rrd file) of an episode. The default writes nothing.
 
     Raises:
         Interrupted: Ctrl-C was pressed.
@@ -209,8 +209,8 @@ class Detached(Interrupted):
 def run_blocks(study: Study, prepare: Prepare, record: Run, on_event: OnEvent) -> Outcome:
     """Queue the blocks of a plan, and run them: in this process, in worker processes, or on a cluster.
 
-    However it ends, no process of this machine runs a block after that, and none of the plan's blocks stays queued.
-    Only a cluster's workers go on if this process is killed.
+    When this function returns or raises, no process of this machine runs the plan's blocks any more. No block stays
+    queued, unless the workers of a cluster go on without this command. They also go on if this process is killed.
 
     Args:
         study: The study with its plan.
@@ -263,7 +263,7 @@ def work_on(study: Study, run_id: str, on_event: OnEvent, save: Save) -> None:
         study: The study.
         run_id: Only blocks of the command with this id. Empty: all.
         on_event: Called with each event, to show progress.
-        save: Writes a recording.
+        save: Writes the recording (.rrd file) of an episode.
 
     Raises:
         UsageError: The study is not in the database, or its device is not on this machine.

@@ -37,7 +37,7 @@ from kerv_cli.lab.queue import Claim, ClaimLost, Queue, patiently
 from kerv_cli.targets.provenance import stamp
 
 POLL_SECONDS = 1.0
-"""Seconds between two looks at the queue while other processes run all blocks that are left."""
+"""Seconds between two queries of the queue while other processes run all blocks that are left."""
 
 RunEpisode = Callable[[int], EpisodeRecord]
 """Function that runs the episode with a given seed."""
@@ -50,7 +50,7 @@ def work(queue: Queue, prepare: Prepare, on_event: OnEvent = lambda event: None)
     """Run the blocks of a queue until none is left.
 
     If a setting fails, it is reported and the other settings go on. While other workers run all blocks that are left,
-    wait, to take over those of a worker that dies.
+    wait: if one of them dies, its block is free again.
 
     Args:
         queue: The blocks.

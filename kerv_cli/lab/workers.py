@@ -33,11 +33,14 @@ from kerv_cli.lab.queue import Queue, patiently
 from kerv_cli.lab.store import Study
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-"""Numerical libraries read these when they load, before torch.set_num_threads can be called."""
+"""Environment variables with the number of CPU threads of numerical libraries.
+
+The libraries read them when they load, before torch.set_num_threads can be called.
+"""
 GPUS = "CUDA_VISIBLE_DEVICES"
 
 MOST_STILLBORN = 3
-"""So many workers in a row may die before they claim a block. Then the sweep ends."""
+"""After this many workers in a row have died before they claimed a block, the sweep ends."""
 _POLL_SECONDS = 0.3
 _LOOK_SECONDS = 5.0
 """Seconds between two questions to Slurm."""
@@ -63,7 +66,9 @@ def last_line(text: str) -> str:
 
 
 def gpus_in_turn(device: str) -> list[str]:
-    """Return the GPUs that workers get in turn, as values of CUDA_VISIBLE_DEVICES. Empty: workers see what is here.
+    """Return the GPUs that workers get in turn, as values of CUDA_VISIBLE_DEVICES.
+
+    Empty: the workers see the same GPUs as this process.
 
     Args:
         device: Device of the settings. A GPU with a number, as in `cuda:1`, is the same for all workers.
@@ -99,7 +104,7 @@ def follow(queue: Queue, progress: Progress, tend: Callable[[], None]) -> None:
     Args:
         queue: The blocks.
         progress: Reads from the database what has ended.
-        tend: Called at each look, to replace workers that ended.
+        tend: Replaces workers that have ended. It is called each time before the database is read.
     """
     shown: set[tuple[int, str]] = set()
     while patiently(queue.left)[0]:
@@ -211,11 +216,14 @@ def _ask(program: str, *words: str, text: str = "", environment: dict[str, str] 
 
 
 class Array:
-    """The workers of a study on a cluster. If an earlier sweep's array still waits or runs, it is that one.
+    """The workers of a study on a cluster: an array of Slurm jobs.
+
+    If an array that an earlier sweep of the study submitted still waits or runs, it is used. Otherwise a new one is
+    submitted.
 
     Args:
         queue: The blocks.
-        runtime: Number of workers, and what each needs.
+        runtime: Number of workers, and the resources that each needs.
         threads: Number of CPU threads of each.
 
     Raises:
