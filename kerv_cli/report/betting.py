@@ -50,7 +50,8 @@ def wealth(values: np.ndarray, bound: float, delta: float) -> np.ndarray:
     Args:
         values: (n,) in [0, 1], in the order in which they came.
         bound: The hypothesis is a mean of at least `bound`, in (0, 1).
-        delta: Error probability δ for which the bets are optimised. Tests of the wealth may use another δ.
+        delta: Error probability δ for which the bets are optimised. The wealth may still be compared with 1/δ of
+            another δ.
     """
     return np.exp(np.cumsum(np.log1p(bets(values, bound, delta) * (bound - values))))
 

@@ -19,7 +19,7 @@ def tables(calibration: Calibration, path: Path) -> Iterator[Table]:
 
     Args:
         calibration: The calibration.
-        path: Its file, which the title names.
+        path: The calibration's file, named in the title of the tables.
     """
     columns: tuple[str, ...] = ("task", "fitted on", "decodes", "K_S")
     rows: list[tuple[object, ...]] = []

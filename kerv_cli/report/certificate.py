@@ -107,7 +107,7 @@ def planned_certificate(
 
     Args:
         resolved: The study.
-        store: Where its episodes are stored.
+        store: The same study, as it is stored in the database.
         wanted: Episodes that the test will use.
         settings: Settings of the test.
 

@@ -86,8 +86,8 @@ def pairs_to_compare(database: Database, first: str, second: str) -> list[tuple[
 
     Args:
         database: The database.
-        first: Name of the first run, as in `compared_runs`.
-        second: Name of the second run.
+        first: Id of the first run, or `ID:LABEL` for one of its settings.
+        second: The same for the second run.
 
     Raises:
         UsageError: There is no such setting, a run has no episodes, or only one of the runs is a training.

@@ -39,7 +39,7 @@ class Choice:
             were not timed.
         episode_speedup: Speed per episode of the chosen setting, or else of the candidate, against the baseline. NaN if
             it was not timed.
-        runs: Number of runs that the interval of `episode_speedup` covers.
+        runs: Number of runs (commands) from which the interval of `episode_speedup` was computed.
     """
 
     where: str
@@ -74,7 +74,7 @@ def choices(results: Iterable[Result], task_results: Iterable[Result], loss: flo
 
     Args:
         results: The study's rows over all tasks.
-        task_results: Its rows per task.
+        task_results: The study's rows per task.
         loss: Largest acceptable loss of success against the baseline, in points.
     """
     tasks: dict[str, list[Result]] = {}
@@ -84,11 +84,11 @@ def choices(results: Iterable[Result], task_results: Iterable[Result], loss: flo
 
 
 def choose(where: str, rows: Sequence[Result], loss: float) -> Choice:
-    """Choose a setting for one task or for all tasks.
+    """Choose the fastest setting that is shown to lose less success than `loss`, for one task or for all tasks.
 
     Args:
         where: The task's name, or `all tasks`.
-        rows: The table's rows for that task or for all tasks, one per setting, the baseline included.
+        rows: Rows of the study's table for that task or for all tasks: one per setting, the baseline included.
         loss: Largest acceptable loss of success against the baseline, in points.
     """
     success = next((row.measures.success.value for row in rows if row.is_baseline), math.nan)
@@ -147,7 +147,7 @@ def safety(row: Result) -> tuple[float, float]:
 
 
 def passing(rows: Iterable[Result], loss: float) -> list[Result]:
-    """Return the rows of settings that are shown to lose less than `loss`: those before the first that is not.
+    """Test the settings in order. Return the rows before the first setting that is not shown to lose less than `loss`.
 
     By fixed-sequence testing, all tests together have the error rate of one test.
 

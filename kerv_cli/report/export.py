@@ -33,9 +33,9 @@ def export(run: RunEntry, database: Database, to: str, folder: Path) -> list[Pat
 
     Args:
         run: A sweep, rollout or import.
-        database: Its database.
-        to: A format: one of FORMATS.
-        folder: Where the files go.
+        database: The database that has the run.
+        to: One of FORMATS. `trace` is a JSON file with one line per decode (docs/trace.md).
+        folder: Folder to write to.
 
     Raises:
         UnknownName: There is no such format.

@@ -52,15 +52,18 @@ def explained(label: str, method: str = "") -> str:
 
 
 def explanations(settings: Iterable[tuple[str, str]]) -> dict[str, str]:
-    """Return what each setting is, by its label, and what *tokens unverified* are, by that heading.
+    """Explain a table's settings, and its column *tokens unverified*.
 
     Args:
         settings: Label and method of each setting.
+
+    Returns:
+        A dictionary from label or heading to explanation. Settings whose names have no known word are left out.
     """
     found = {label: explained(label, method) for label, method in settings}
     return {name: text for name, text in found.items() if text} | {"tokens unverified": UNVERIFIED}
 
 
 def with_code(text: str) -> Markup:
-    """Return a text as HTML, with `…` in it as code. A filter of templates."""
+    """Return a text as HTML. What it has in backticks becomes <code>. Templates use this function as a filter."""
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))

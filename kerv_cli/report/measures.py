@@ -151,10 +151,10 @@ class Speeds(NamedTuple):
     """Speedups of a group of pairs: mean time of the baseline ÷ mean time of the method.
 
     Attributes:
-        speedup: Of the seconds per control step.
-        episode_speedup: Of the seconds per episode.
-        solved_speedup: Of the seconds per episode, over the pairs that both solved. One failed episode runs to the
-            horizon and can decide the others.
+        speedup: Ratio of the mean seconds per control step.
+        episode_speedup: Ratio of the mean seconds per episode.
+        solved_speedup: Ratio of the mean seconds per episode, over the pairs that both solved. A failed episode runs to
+            the horizon, so a single one can decide the other two ratios.
     """
 
     speedup: Estimate = stats.NO_ESTIMATE

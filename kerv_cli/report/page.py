@@ -35,7 +35,11 @@ _FRAMES = 240
 def render(data: StudyData, loss: float, priced: Sequence[Priced] = (), tables: Sequence[Path] = ()) -> str:
     """Return the study's page as one HTML file that needs no other file and no network.
 
-    `study_parts` explains the arguments.
+    Args:
+        data: The study's episodes and tables.
+        loss: Largest loss of success, in points, that the verdict accepts.
+        priced: The study's speeds on other machines, from `repriced`.
+        tables: CSV files of the study, which are linked.
     """
     loader = PackageLoader("kerv_cli.report", "templates")
     templates = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
@@ -95,9 +99,10 @@ def study_parts(
 
 
 def figures_of(data: StudyData, loss: float) -> dict[str, alt.ConcatChart]:
-    """Return the study's charts. A key is what the chart adds to the study's name in its file's name: `_latency`.
+    """Return the study's charts.
 
-    `loss` is the largest acceptable loss of success, in points.
+    Each key is the suffix of a file name: `_latency` is the chart for `<study>_latency.png`. `loss` is the largest
+    acceptable loss of success, in points.
     """
     figures = study_figures(data.results, data.study.axis, loss)
     if len(latency_table(data.results)):

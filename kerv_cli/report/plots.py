@@ -56,7 +56,7 @@ def study_figures(results: Sequence[Result], axis: str, loss: float = 3.0) -> di
         loss: Largest acceptable loss of success, in points.
 
     Returns:
-        The charts. A key is what the chart adds to the study's name in its file's name, such as `_tradeoff`. Empty if
+        The charts. Each key is the suffix of a file name: `_tradeoff` is the chart for `<study>_tradeoff.png`. Empty if
         there is nothing to draw.
     """
     rows = _drawn(results)
@@ -91,10 +91,10 @@ def _drawn(results: Sequence[Result]) -> pd.DataFrame:
 
 
 def with_lines(rows: pd.DataFrame, axis: str) -> pd.DataFrame:
-    """Add the columns `line` (name of the line that joins a setting's point to others) and `x` (its value on the axis).
+    """Add two columns: `line`, the name of the line that joins points, and `x`, the setting's value on the x axis.
 
-    Settings that differ only in the value of `axis` are on one line. A setting whose value is no number, or that is
-    alone on its line, gets a line of its own and no x.
+    Settings that differ only in the value of `axis` share a line. If a setting's value is no number, or if no other
+    setting shares its line, then `line` is the setting's label, and `x` is missing.
     """
     numbers = rows[axis] if axis in rows else pd.Series(None, rows.index, dtype=object)
     x = numbers.map(lambda value: float(value) if is_number(value) else None).astype(float)
@@ -197,7 +197,11 @@ def lines_figure(measures: Iterable[pd.DataFrame], xlabel: str, ylabel: str | No
 
 
 def latency_figure(results: Sequence[Result]) -> alt.ConcatChart:
-    """Draw success against the time that an AR decode takes, with one panel per kind of delay compensation."""
+    """Draw success against decoding latency, with one panel per kind of delay compensation.
+
+    Only settings whose world goes on during a decode are drawn. The x axis has the latency of the AR baseline under the
+    same clock. So methods that ran under the same clock have the same x.
+    """
     latencies = latency_table(results).set_index("label")["ar_latency_ms"]
     rows = _drawn(results)
     rows = rows.assign(x=rows["label"].map(latencies)).query("x > 0").sort_values("x", kind="stable")

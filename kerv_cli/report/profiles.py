@@ -48,9 +48,10 @@ class NamedProfile:
 
     @property
     def encoders(self) -> dict[str, Profile]:
-        """The same costs with a faster or slower encoder, by `ENCODERS`. Empty if the encoder's floor is unknown.
+        """The same costs with a faster or slower encoder, by the keys of `ENCODERS`.
 
-        An engine's system time comes on top.
+        The engine's system time is added to the encoder's time. Empty if the encoder's floor is unknown: the shortest
+        time that the device's bandwidth and arithmetic allow.
         """
         about, phases = self.profile.about, self.profile.phases
         floor, system = about.get("encoder_floor"), float(about.get("encoder_system", 0.0))
@@ -64,8 +65,8 @@ class NamedProfile:
 
         Args:
             tokens: N, number of tokens of the chunks to price.
-            kinds: Kinds of costs that are needed.
-            setting: Label of the setting that needs them. Empty: do not name it.
+            kinds: Kinds of costs that are needed, such as `verify`.
+            setting: Label of the setting whose decodes are priced, for the message. Empty: no setting is named.
 
         Raises:
             UsageError: The message names the missing cost and the command that measures it.

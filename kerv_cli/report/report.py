@@ -134,7 +134,10 @@ def write_study(data: StudyData, loss: float, priced: Sequence[Priced] = (), pub
 
 
 def tables_of(data: StudyData, priced: Sequence[Priced]) -> dict[str, pd.DataFrame]:
-    """Return the tables of a study's CSV files. A key is what a file's name adds to the study's name: `_per_task`."""
+    """Return the tables of a study's CSV files.
+
+    Each key is the suffix of a file name: `_per_task` is the table for `<study>_per_task.csv`.
+    """
     tables = {"": data.table[list(CSV_COLUMNS)], "_per_task": data.per_task[list(CSV_COLUMNS)]}
     if priced:
         tables["_on"] = prices_table(priced)

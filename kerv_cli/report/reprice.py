@@ -38,7 +38,7 @@ class Priced:
     Attributes:
         result: The setting's row as measured, pooled over tasks.
         machine: The profile.
-        measures: The same measures, estimated.
+        measures: The measures of `result`, estimated for the machine.
         encoders: Estimated speeds per episode with another encoder, by `ENCODERS`. Empty for measured profiles.
     """
 
@@ -49,7 +49,7 @@ class Priced:
 
     @property
     def columns(self) -> Row:
-        """The row of `prices_table`."""
+        """The setting's row in `prices_table`."""
         result, of, measured = self.result, self.measures, self.result.measures
         machine = {"on": self.machine.name, "machine": self.machine.title, "projected": self.machine.is_projected}
         speeds = {"episode_speedup": of.episode_speedup, "speedup": of.speedup}
@@ -105,12 +105,20 @@ def _estimated(data: StudyData, works: Mapping[str, _LabelWork], profile: Profil
 
 
 def own_prices(data: StudyData) -> list[Priced]:
-    """Return `prices_on` the machines that the study's file names and, if it was benchmarked, on its own."""
+    """Return the study's speeds, estimated for the machines that its file names.
+
+    If the study's own machine was benchmarked, the estimates for it follow.
+    """
     return prices_on(data, dict.fromkeys((*data.study.machines, *own_profiles(data))))
 
 
 def prices_on(data: StudyData, names: Iterable[str]) -> list[Priced]:
-    """Return `repriced` for those profiles that exist and have all costs."""
+    """Return the estimates of `repriced` for several machines.
+
+    Args:
+        data: The study's episodes.
+        names: Names of cost profiles. A profile that is missing or lacks a cost is left out.
+    """
     rows = []
     for name in names:
         with suppress(UsageError):
@@ -181,7 +189,10 @@ def _work_of_label(data: StudyData, label: str) -> _LabelWork:
 
 
 def levels_of(settings: Mapping[str, Any]) -> int:
-    """Return the levels of the trees that a setting drafts, for episodes from before rounds had levels. 0: chains."""
+    """Return the number of levels of the trees that a setting drafts. 0: it drafts chains.
+
+    This is needed for episodes of older versions of kerv, whose rounds do not have this number.
+    """
     proposer = settings.get("proposer", {})
     return int(proposer["depth"]) if proposer.get("shape") == "tree" else 0
 

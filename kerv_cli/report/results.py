@@ -38,7 +38,7 @@ class Measures:
         phases: Time per control step in milliseconds, by phase of a decode. Keys begin with `ms.`.
         steps_to_success: Mean number of control steps of the episodes that succeeded.
         path_m: Mean path of the end effector in the episodes that succeeded, metres.
-        jerk: Mean jerk of the end effector.
+        jerk: Mean of the episodes' root mean square jerk of the end effector, m/s³.
         near_contact_failure: Share of the failures in which the hand came near the object.
         latency_p50_ms: Median time of a decode.
         latency_p95_ms: Time that the slowest 5 % of the decodes take at least.
@@ -54,14 +54,14 @@ class Measures:
         deviation: Mean distance of the executed actions from those of AR.
         felt_latency_ms: Mean time that the world went on during a decode.
         felt_latency_steps: The same in control steps.
-        held_share: Share of control steps on a held action.
+        held_share: Share of control steps that repeated the last action, because no newer one had arrived.
         added: Values of the columns that plugins add, by name.
         counts: Outcomes of the pairs with the baseline.
         mcnemar_p: p-value of McNemar's exact test. NaN if there are no pairs.
         difference: Success rate minus the baseline's.
         margin: Loss of success below which a setting counts as non-inferior to the baseline.
-        non_inferior: Whether the loss is shown to be smaller than that.
-        pairs_to_settle: Number of pairs that would show it, see `statistics.pairs_to_settle`.
+        non_inferior: Whether the loss of success is shown to be smaller than `margin`.
+        pairs_to_settle: Number of pairs that would show a loss below `margin`, see `statistics.pairs_to_settle`.
         same_run: Whether the two episodes of every pair come from one run.
         same_block: Share of pairs that were measured in one block (side by side in one process).
         steps: Number of control steps.
@@ -135,16 +135,16 @@ class Result:
         label: Label of the setting.
         series: Name that the settings along the study's axis share.
         unstressed: Label of the same setting without stress.
-        method: Its decoding method.
+        method: The setting's decoding method.
         task: Names of the tasks.
         tasks: Number of tasks.
-        difficulty: Their difficulty groups.
-        seeds: Their seeds, as `seeds_text` writes them.
+        difficulty: Difficulty groups of the tasks.
+        seeds: Seeds of the episodes, as `seeds_text` writes them.
         repeats: How often every episode was measured.
         episodes: Number of episodes.
-        baseline: Label of the setting that it is compared with.
-        measures: What was measured.
-        runs: Number of runs that the intervals of speed cover.
+        baseline: Label of the setting that this one is compared with.
+        measures: Measured values.
+        runs: Number of runs (commands) from which the intervals of speed were computed.
         overrides: Overrides of the setting, as typed.
         settings: The setting, with dotted keys.
         observation: What the target observes.
@@ -204,7 +204,7 @@ def columns_of(values: Mapping[str, Any]) -> Row:
     """Return the fields of a row as the columns of a table.
 
     An `Estimate` becomes three columns: its name, and with the endings _low and _high its interval. `PairedCounts`
-    become their number `pairs` and one column per outcome. The keys of a mapping are columns.
+    become their number `pairs` and one column per outcome. A mapping becomes one column per key.
 
     Args:
         values: Fields by name, such as `vars(result)`.

@@ -259,9 +259,9 @@ def speedup(
 def over_runs(estimates: Sequence[Estimate], same_pairs: bool) -> Estimate:
     """Combine the speedups that several runs measured.
 
-    The value is the geometric mean. The half width of the logarithm's 95 % interval is Student's t with k − 1 degrees
-    of freedom, over the k runs. If all runs have the same pairs, the runs do not show how much the pairs matter. Then
-    the half width of the interval over pairs is added in squares.
+    The value is the geometric mean of the k speedups. Its 95 % interval is computed for the logarithm, by Student's t
+    with k − 1 degrees of freedom. If all runs have the same pairs, their spread does not show how much the choice of
+    pairs matters. Then the mean half width of the intervals over pairs is added in squares.
 
     Args:
         estimates: The speedup in each run, with the interval over its pairs.

@@ -165,7 +165,7 @@ class SummaryTable:
 
 
 def of_runs(results: Sequence[Result]) -> str:
-    """Return one sentence that says how many runs the intervals of speed cover."""
+    """Return one sentence that says from how many runs the intervals of speed were computed."""
     runs = min(row.runs for row in results)
     return f"Intervals of speed: of {runs} runs." if runs > 2 else "Intervals of speed: of this run alone."
 

@@ -65,7 +65,8 @@ class StudyData:
             machine. Each run measured all episodes of the study, or all settings and tasks on seeds of its own. Empty
             if there are no such runs.
         same_pairs: Whether each run measured all episodes of the study.
-        against: What the tables' names add to the study's, if they compare with another baseline than the study does.
+        against: Suffix of the tables' names, such as `_against_ar`, if they compare with another baseline than the
+            study's own. Else empty.
     """
 
     study: Study
@@ -414,14 +415,14 @@ def split_values(texts: Iterable[object]) -> set[str]:
 
 
 def further_of(data: StudyData) -> dict[str, Any]:
-    """Return everything that a study's CSV files leave out, as JSON values.
+    """Return the facts about a study that its CSV files leave out, as JSON values.
 
     Returns:
         A dictionary with the keys `study` (its name), `axis` (key of the plots' x axis) and `labels`. The last maps
         each setting's label to a dictionary:
 
         - `name`, `overrides` and `settings` of the setting
-        - `varies`: values of the keys that differ within its grid
+        - `varies`: values of the keys that differ within its grid (the settings that one entry of the study expands to)
         - `identity`: hashes of weights and data
         - `provenance`: executor, machine, versions and the like
         - `measures`: for each averaging and each task, the measures that have no column in the CSV files
@@ -504,7 +505,8 @@ _LATENCY_COLUMNS = (
 def latency_table(results: Iterable[Result]) -> pd.DataFrame:
     """Return the rows of settings whose world goes on during a decode (`rollout.clock=real`).
 
-    The baseline must have such a world, too. The added column `ar_latency_ms` is the mean latency of its decodes.
+    A row is left out if the world of its baseline waits. The added column `ar_latency_ms` is the mean latency of the
+    baseline's decodes.
     """
     rows = averaged(results)
     latencies = {row.label: row.measures.felt_latency_ms for row in rows}

@@ -188,7 +188,7 @@ def under_conditions(rows: Sequence[Result]) -> str:
 def caution(results: Sequence[Result]) -> str:
     """Return one line that the reader should know before reading the numbers. Empty if there is nothing to say.
 
-    It names policies that are given the positions of object and goal, and settings that verify nothing.
+    The line names policies that are given the positions of object and goal, and settings that verify nothing.
     """
     privileged, unverified = set(), []
     for row in averaged(results):
