@@ -293,7 +293,7 @@ def _add_hashes(made_from: dict[str, str], label: str, identity: Mapping[str, st
 def description_of(run: RunEntry) -> dict[str, Any]:
     """Return the provenance of an artifact: the command, settings and data that made it.
 
-    Empty if it is unknown, or before a training's first validation.
+    Empty if the provenance is unknown, and for a training that has not reached its first validation.
 
     Raises:
         CheckpointError: The artifact's description is damaged.
@@ -423,7 +423,7 @@ def remove(run: RunEntry, database: Database) -> None:
 
     Args:
         run: The entry to remove.
-        database: Its database.
+        database: The database that has the entry's rows.
 
     Raises:
         StorageError: The disk is full or not writable.
@@ -450,7 +450,7 @@ def plan_of(run: RunEntry, database: Database) -> Study:
 
     Args:
         run: The sweep or rollout to repeat.
-        database: Its database.
+        database: The database that has the sweep or rollout.
 
     Raises:
         CheckpointError: The weights or data of the run have changed since.

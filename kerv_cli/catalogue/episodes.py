@@ -74,8 +74,8 @@ class FoundEpisode:
         episode: Setting, task, seed and repeat.
         row: Columns of the table `episodes`, without `decode_seconds`, and of its setting.
         about: Machine and versions that ran it.
-        earlier: Seeds that must run before it to give the same tokens, in their order. Empty, unless the setting's skip
-            rule adapts from episode to episode.
+        earlier: Seeds that must run before this episode, in this order, so that it gives the same tokens again. Empty
+            unless the setting's skip rule adapts from episode to episode.
     """
 
     id: int

@@ -116,7 +116,8 @@ def import_evaluations(
         words: Command-line arguments (without `kerv`) of the import.
 
     Returns:
-        Name of the study. And lines of text: for each evaluation with errors or missing episodes, how many there are.
+        Name of the study, and a list of notes. A note says how many episodes of an evaluation ended in an error, or how
+        many are missing.
 
     Raises:
         UsageError: A path holds no evaluation, the evaluations cannot be compared, another study has the same name, or
