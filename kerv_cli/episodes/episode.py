@@ -141,8 +141,14 @@ def episode(
     """Run one episode like `run_episode`, but let the caller decode.
 
     The generator yields an observation; send it the record of the decode. At the end it returns the episode's record.
-    `follower` is the decoder itself, or what a batch decoder keeps for this episode. `run_episode` describes the other
-    arguments.
+
+    Args:
+        world: The environment, opened for one task.
+        follower: Stores the episode's past actions and positions. It is the decoder itself, or the object that a batch
+            decoder has for this episode.
+        seed: Seed of the initial state.
+        camera: View to record, one image per control step; None to record no images.
+        clock: Latency of decodes, if the world goes on meanwhile (docs/methods.md §8); None if the world waits.
     """
     began = time.perf_counter()
     world.reset(seed)

@@ -42,8 +42,8 @@ def check(settings: RolloutSettings) -> dict[str, str]:
     """Refuse settings that cannot run, before anything slow starts.
 
     Returns:
-        Everything besides the settings that determines the results. These are the hashes of files with
-        weights or data, by the kind of file. The key `observation` says what the policy observes, such as `vision`.
+        The facts besides the settings that determine the results. They are the hashes of files with weights or data, by
+        the kind of file. The key `observation` says what the policy observes, such as `vision`.
 
     Raises:
         UsageError: A number is out of range, a seed is a training seed, the policy was trained on another camera, or
@@ -103,8 +103,8 @@ def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
     """Return the decoder for one setting (a method with all its options) on one task, warmed up.
 
     Raises:
-        UsageError: As in `check`.
-        CheckpointError: As in `check`.
+        UsageError: The settings cannot run; `check` lists the reasons.
+        CheckpointError: The policy is missing or damaged, or a file belongs to another target or action space.
     """
     spec = spec_of(task)
     expert = settings.policy.kind == EXPERT

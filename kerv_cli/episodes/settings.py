@@ -114,7 +114,7 @@ class SweepSettings(CommandSettings):
 
 @dataclass(kw_only=True)
 class WorkSettings(CommandSettings):
-    """Settings of `kerv work`, which runs blocks of a study that a sweep has planned."""
+    """Settings of `kerv work`, which runs blocks (groups of episodes) that a sweep has planned and queued."""
 
     study: str = setting("", "name or file of the study")
     run: str = setting("", "only blocks of the command with this id, whose process ends this one by closing its input")
