@@ -226,8 +226,8 @@ class Study:
 
         Args:
             rerun: Which existing episodes to run again: NEVER, TIMED, CHANGED or ALL (`lab/plan.py`).
-            since: Used only with ALL, if an interrupted command is resumed: the time at which it began (ISO 8601). Empty:
-                all episodes run again.
+            since: Used only with ALL, if an interrupted command is resumed: the time at which that command began (ISO
+                8601). Empty: all episodes run again.
             runtime: Executor, workers and device.
             command: Command-line arguments (without `kerv`) that resume the study.
         """
