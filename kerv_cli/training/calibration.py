@@ -77,10 +77,10 @@ DAMPINGS = (0.95, 0.9, 0.85, 0.8, 0.75, 0.7, 0.6, 0.5, 0.3)
 def calibrate(
     settings: CalibrateSettings, database: Database, begin: Begin = quietly
 ) -> tuple[Path, Calibration, list[str]]:
-    """Measure everything and write the calibration.
+    """Measure the sections of a calibration that the settings allow, and write them to its JSON file.
 
-    K_S is not measured if `decodes` is 0 or the drafter is missing. Skip levels, the smallest similarities at which
-    verification is skipped, are not measured without a datastore.
+    The reference levels K_S of the kinematic variability are not measured if `decodes` is 0 or the drafter is missing.
+    Skip levels, the smallest similarities at which verification is skipped, are not measured without a datastore.
 
     Args:
         settings: Settings of `kerv calibrate`.
@@ -178,10 +178,11 @@ def presample(
         chosen: Indices of the episodes that are used.
         tasks: Full names of the tasks.
         decodes: Number of decodes per task.
-        progress: Called with the numbers of tasks done and of all.
+        progress: Called with two numbers: finished tasks, all tasks.
 
     Returns:
-        For each task its reference level K_S, the median K.
+        For each task its reference level K_S: the median over its decodes of K, the distance between the draft and the
+        target's tokens.
 
     Raises:
         KervError: No decode of a task compared a draft with the target.
@@ -203,8 +204,8 @@ def presample(
 def reference_level(records: Sequence[DecodeRecord], actions: ActionSpace, chunk: int) -> Variability:
     """Return a task's reference level K_S: the median of the variability K over the decodes, for each measure of K.
 
-    Decoding divides by K_S, so it must not be 0. If the median is lower, K_S is the smallest possible K above 0, which
-    is that of a chunk with a single token off by one bin.
+    Decoding divides by K_S, so it must not be 0. It is at least the smallest possible K above 0: that of a chunk in
+    which a single token is off by one bin.
 
     Args:
         records: Decodes of the task.
@@ -256,8 +257,8 @@ def fit_boundary(
     Args:
         paths: End effector in each episode, (T, 3) metres.
         windows: Window lengths, in positions.
-        old: A calibration whose ranges are kept.
-        progress: Called with the numbers of window lengths done and of all.
+        old: An earlier calibration. Its ranges are kept for the window lengths that it has. None: there is none.
+        progress: Called with two numbers: finished window lengths, all window lengths.
 
     Raises:
         CheckpointError: No path is curved.
@@ -271,9 +272,9 @@ def fit_boundary(
 
 
 def completed(old: Calibration, new: Calibration) -> Calibration:
-    """Return the old calibration with numbers of the new one where the old one has none.
+    """Return the old calibration, and fill in the numbers that it lacks from the new one.
 
-    It takes the boundary ranges of `new`, which kept the old ones where there were any.
+    The boundary ranges are those of `new`, because `fit_boundary` has already kept the old ones in them.
     """
     noise = {}
     for kind in FILTERS:
@@ -343,7 +344,7 @@ def read_windows(
         actions: The action space, to normalise actions.
         window: Number of control steps before each moment.
         horizon: Number of control steps after each moment.
-        progress: Called with the numbers of episodes read and of all.
+        progress: Called with two numbers: episodes read, all episodes.
 
     Raises:
         KervError: A task has no episode that is longer than the window.
@@ -520,7 +521,7 @@ def skip_section(
         tasks: Full names of the tasks.
         epsilon: Largest mean absolute error of a good chunk, in normalised action units.
         confidence: Minimum share of good chunks among the skipped ones.
-        progress: Called with the numbers of tasks done and of all.
+        progress: Called with two numbers: finished tasks, all tasks.
 
     Returns:
         The thresholds. None if the datastore holds none of the tasks.

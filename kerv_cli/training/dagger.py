@@ -90,7 +90,7 @@ class PolicyActs:
 
     @classmethod
     def of(cls, settings: DemosSettings, spec: EnvironmentSpec) -> PolicyActs:
-        """Check that a recording's policy can act in an environment, and return what makes its `PolicyActor`.
+        """Check that a recording's policy can act in an environment. Return the function that makes its `PolicyActor`.
 
         The recording may contain more camera views than the target sees, to train another target on them.
 

@@ -175,7 +175,7 @@ def entries_of(target: Any, episode: DemoEpisode, space: ObservationSpace, key: 
 def contents_of(
     columns: dict[str, np.ndarray], shards: Mapping[str, Shard], components: int, half: bool
 ) -> dict[str, Any]:
-    """Return the files to write: an array or table by file name.
+    """Return the contents of a datastore's files: by file name, an array or a table.
 
     Args:
         columns: The values of each column, one row per entry of all tasks.

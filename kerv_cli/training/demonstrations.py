@@ -89,8 +89,8 @@ def demos_for(settings: S, target: TargetDescription, database: Database) -> tup
         database: The database of the results folder.
 
     Returns:
-        settings: The settings with `demos` filled in. If `task` is empty, and the demonstrations have tasks that the
-            target was not trained on, `task` names all their other tasks.
+        settings: The settings with `demos` filled in. `task` is filled in if it is empty and the demonstrations have
+            tasks that the target was not trained on. It then names the recorded tasks that the target was trained on.
         dataset: The demonstrations.
 
     Raises:
@@ -158,7 +158,7 @@ def check_spaces(dataset: DemoDataset, actions: ActionSpace, observation: Observ
 
 
 def seen_by(dataset: DemoDataset, camera: str, who: str, remedy: str) -> DemoDataset:
-    """Return the dataset with only the views of `camera`. Views that were recorded to the right of them are left out.
+    """Return the dataset with only the views of `camera`, which must be the leftmost views in each image.
 
     Args:
         dataset: The demonstrations.

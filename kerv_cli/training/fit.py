@@ -37,7 +37,7 @@ Validate = Callable[[Any], Metrics]
 Save = Callable[[Any, Metrics], None]
 """Takes the network and the metrics of its validation, and writes its weights."""
 Progress = Callable[[int, int, str], None]
-"""Takes the numbers of steps done and of all, and the latest metrics as text."""
+"""Takes the number of finished steps, the number of all steps, and the latest metrics as text."""
 
 _UNREADABLE = (OSError, EOFError, RuntimeError, KeyError, TypeError, ValueError, pickle.PickleError, zipfile.BadZipFile)
 SAME_REQUEST = 2.0
@@ -61,12 +61,12 @@ def fit(
 
     Args:
         network: The network, on its device.
-        loss: The loss of a step.
-        validate: The metrics of the averaged weights. It is called every `settings.validate_every` steps.
-        save: Called after each validation whose score is the best so far.
+        loss: Returns the loss of a step.
+        validate: Returns the metrics of the averaged weights. It is called every `settings.validate_every` steps.
+        save: Writes the averaged weights. It is called after each validation whose score is the best so far.
         settings: Optimisation settings.
         folder: Folder for the resume file and `log.csv`.
-        identity: Hash of everything that determines the training. It goes into the resume file.
+        identity: Hash of the settings and data that determine the training. The resume file stores it.
         progress: Called after each step and after each validation.
 
     Returns:
@@ -99,13 +99,13 @@ def fit(
 
 
 class State:
-    """All that changes during a training: weights, their average, optimiser, step and metrics.
+    """The state of a training: weights, the average of the weights, optimiser, step and metrics.
 
     Args:
         network: The network to train.
         settings: Optimisation settings.
         folder: Folder for the resume file and `log.csv`.
-        identity: Hash of everything that determines the training.
+        identity: Hash of the settings and data that determine the training.
     """
 
     def __init__(self, network: nn.Module, settings: TrainSettings, folder: Path, identity: str) -> None:
@@ -149,8 +149,8 @@ class State:
         """Validate the averaged weights, save them if their score is the best so far, and write the resume file.
 
         Args:
-            validate: See `fit`.
-            save: See `fit`.
+            validate: Returns the metrics of the averaged weights.
+            save: Writes the averaged weights.
             training_loss: Loss of the last step, to log beside the metrics.
 
         Raises:

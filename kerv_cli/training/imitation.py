@@ -69,7 +69,7 @@ def load_samples(
         settings: Shapes of the target.
         words: Tokenizer of the instructions.
         task_names: Full names of the tasks.
-        progress: Called with the numbers of episodes read and of all.
+        progress: Called with two numbers: episodes read, all episodes.
         waypoints: Number of later positions of the hand that the policy learns to estimate. 0: it learns the positions
             of object and goal instead.
 
@@ -293,7 +293,7 @@ def check_init(settings: TargetSettings, camera: str, description: TargetDescrip
         settings: Shapes of the new target.
         camera: Camera of the new target. Several views are joined by `+`.
         description: Description of the target with the initial weights.
-        folder: Its folder, for the error message.
+        folder: Folder of the target with the initial weights, for the error message.
 
     Raises:
         UsageError: A shape or the camera differs. The message names the first difference.

@@ -34,17 +34,17 @@ NOT_IDENTITY = ("steps", "validate_every", "init", "stored")
 
 
 def quietly(kind: str, folder: Path, plan: str, units: int) -> Stage:
-    """Begin without a note in the database, and show no progress. See `Begin`."""
+    """Begin an artifact without a row in the database, and show no progress. This is the default for `Begin`."""
     return lambda title: nullcontext(lambda *done: None)
 
 
 def identity_of(train: TrainSettings, dataset: DemoDataset, **own: Any) -> str:
-    """Return a hash of everything that determines the weights after a given number of steps.
+    """Return a hash of the settings and data that determine the weights after a given number of steps.
 
     Args:
         train: Optimisation settings.
         dataset: The demonstrations.
-        **own: What else determines the weights.
+        **own: Further values that determine the weights, such as the network's shapes.
     """
     counted = {key: value for key, value in asdict(train).items() if key not in NOT_IDENTITY}
     counted["closed_loop"] = train.closed_loop > 0  # scores with and without success cannot be compared
@@ -86,7 +86,7 @@ def refuse_unused(train: TrainSettings, keys: Sequence[str], why: str) -> None:
 
 
 def figures_of(dataset: DemoDataset, network: Any, metrics: dict[str, float]) -> dict[str, Any]:
-    """Return what the description of a trained artifact says about its training."""
+    """Return facts about a training for the artifact's description: data, validation metrics, number of parameters."""
     return {
         "demos": {"sha256": dataset.sha256, "config": dataset.manifest.config},
         "validation": metrics,

@@ -52,7 +52,7 @@ def plan(settings: PrepareSettings, database: Database) -> list[Step]:
     Raises:
         UsageError: The target or a method does not exist, or the target does not decode autoregressively and so needs
             no artifacts.
-        CheckpointError: The demonstrations do not exist, or a folder for a new artifact holds another target's.
+        CheckpointError: The demonstrations do not exist. Or a folder for a new artifact holds one of another target.
     """
     artifacts = Artifacts(settings.results, settings.policy)
     description = artifacts.description

@@ -46,7 +46,7 @@ def train_target(settings: TrainTargetSettings, database: Database, begin: Begin
     """Train a compact policy, from the resume file in its folder if there is one.
 
     Args:
-        settings: Settings of `kerv train target`. `demos`, `task` and `train.places` are filled in.
+        settings: Settings of `kerv train target`. This function fills in `demos`, `task` and `train.places`.
         database: The database of the results folder.
         begin: Called once all settings are checked.
 
