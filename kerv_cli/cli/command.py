@@ -94,7 +94,7 @@ def top_keys(part: Command) -> list[str]:
 def commands(words: str = "") -> dict[str, Command]:
     """Return the commands that begin with some words, by name, in the order of the help.
 
-    Only the file that declares them is imported, so that their help and mistakes are fast.
+    Only the file that declares them is imported, so that help and error messages appear quickly.
 
     Args:
         words: Words, such as `train`. Empty: all commands.
@@ -151,8 +151,8 @@ def complete(part: Command, typed: Sequence[str], incomplete: str) -> list[str]:
 
     Args:
         part: The command.
-        typed: The words before.
-        incomplete: The beginning of the word.
+        typed: The words before the one to complete.
+        incomplete: The beginning of the word to complete.
     """
     keys, before = top_keys(part), [word for word in typed if word != "="]
     if before and before[-1] in keys:

@@ -80,11 +80,11 @@ def settings_yaml(settings: Any, indent: str = "") -> str:
 
 
 def end_with_plan(text: str, as_json: bool = False) -> NoReturn:
-    """Print what the command would do, and end it. For the option --plan.
+    """Print what the command would do, and end the command. For the option --plan.
 
     Args:
         text: The plan.
-        as_json: Print it as JSON.
+        as_json: Print the plan as JSON.
     """
     if as_json:
         end_with_json({"plan": text})
@@ -95,7 +95,7 @@ def end_with_plan(text: str, as_json: bool = False) -> NoReturn:
 def end_at_once() -> NoReturn:
     """End a server's process with exit code 0, even if threads still compute answers.
 
-    Python's own end could crash: it frees what a thread in C++ code is using.
+    A normal exit of Python could crash, because it frees memory that a thread in C++ code still uses.
     """
     sys.stdout.flush()
     os._exit(0)
@@ -210,8 +210,8 @@ def progress_bar(title: str, record: Run | None = None, has_estimate: bool = Fal
 
     Args:
         title: Text before the bar.
-        record: The command's row in the database, which also gets the progress. None: no row.
-        has_estimate: Whether the text says how much time is left. Otherwise the bar does.
+        record: The command's row in the database. The progress is also written to it. None: the command has no row.
+        has_estimate: Whether the text says how much time is left. If not, the bar estimates and shows it.
 
     Yields:
         `advance(done, total, text="")`. Call it to move the bar and to change the text after it.

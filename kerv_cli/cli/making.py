@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def as_planned(database: Database, plan: bool = False, as_json: bool = False) -> Iterator[Begin]:
-    """Make an artifact in a `with` block. At its end the database notes how the work ended.
+    """Open a `with` block in which an artifact is made. At the end of the block, store in the database how it ended.
 
     Args:
         database: The database of the results folder.
@@ -24,8 +24,8 @@ def as_planned(database: Database, plan: bool = False, as_json: bool = False) ->
         as_json: Print the plan as JSON.
 
     Yields:
-        Function that the work calls once its settings are checked. It starts the entry in the database, or prints the
-        plan.
+        A function that the code in the block calls once the settings are checked. It writes the command's row in the
+        database. With `plan` it prints the plan instead.
     """
     from kerv_cli.lab import runs
     from kerv_cli.lab.command import current_command

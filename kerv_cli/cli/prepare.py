@@ -56,7 +56,12 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
 
 
 def line_of(command: Sequence[str], overrides: Sequence[str]) -> list[str]:
-    """Return the arguments of a step after `kerv`: its own, and the overrides of `kerv prepare` that it shares."""
+    """Return a step's command-line arguments after `kerv`.
+
+    Args:
+        command: The step's own arguments.
+        overrides: Overrides of `kerv prepare`. Those that the step has, too, are appended.
+    """
     line = list(command)
     for word in overrides:
         key = word.split("=")[0]

@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from kerv_cli.report.tables import StudyData
 
 SECONDS_PER_EPISODE = 3.0
-"""Guess for commands without a study's file, before anything was measured."""
+"""Guess of the seconds per episode, for commands without a study's file, while no episode was measured."""
 BUSY = 1.2
 """Load average per core above which a line says that other programs disturb the measured times."""
 
 
 def planned_study(resolved: ResolvedStudy, command: Sequence[str], is_rollout: bool = False) -> Study:
-    """Plan a study or a rollout: find out which of its episodes must run. Print notes about it to standard error.
+    """Plan a study or a rollout: find out which of its episodes must run. Print notes on the plan to standard error.
 
     The notes give the number of episodes, the overrides that have no effect, the tasks that the policy was not trained
     on, and whether an interrupted rollout is resumed.
@@ -99,7 +99,7 @@ def print_study_plan(planned: Study, as_json: bool, guess: float = SECONDS_PER_E
 
     Args:
         planned: The plan.
-        as_json: Print it as JSON.
+        as_json: Print the plan as JSON.
         guess: Seconds per episode if none was measured.
     """
     from kerv_cli.lab.progress import TimeLeft
@@ -248,7 +248,7 @@ def print_study(data: StudyData, all_columns: bool = False, how: str = "", expla
 
 
 def print_prices(priced: Sequence[Priced]) -> None:
-    """Print the speeds on other machines. Nothing if there are none."""
+    """Print the estimated speeds on other machines. Print nothing if `priced` is empty."""
     from kerv_cli.report.reprice import ASSUMES, repriced_summary
 
     if priced:
