@@ -32,7 +32,7 @@ _LACKS = {
     "model": "its world has no MuJoCo model",
     "range": "its world cannot widen the range of initial states",
 }
-"""Something that a kind of stress needs -> error message for an environment that does not have it."""
+"""What a kind of stress needs from an environment -> error message for an environment that does not offer it."""
 
 
 @dataclass(frozen=True)
@@ -290,7 +290,18 @@ class World(ABC):
     def __init__(
         self, spec: EnvironmentSpec, task: str, camera: CameraSettings | None = None, horizon: int = 0
     ) -> None:
-        """Check the names and numbers. The arguments and errors are those of `EnvironmentSpec.open_world`."""
+        """Check names and numbers. The simulator is built at the first reset.
+
+        Args:
+            spec: The environment.
+            task: Full or short name of the task.
+            camera: Default view of `frame`. None: the environment's first camera.
+            horizon: Control steps of an episode. 0: the environment's default.
+
+        Raises:
+            UnknownName: There is no such task or camera.
+            UsageError: A camera setting is out of range, or the simulator cannot run that many control steps.
+        """
         entry = spec.task(task)
         self.spec, self.task, self.instruction = spec, entry.name, entry.instruction
         self.camera, self.horizon = spec.camera(camera), spec.control_steps(horizon)
@@ -348,7 +359,7 @@ class World(ABC):
 
     @property
     def object_position(self) -> NDArray[np.float64]:
-        """Position (3,) of the object, in metres. NaN if the observation space has no place `object`."""
+        """Position (3,) of the object, in metres. NaN if the state does not contain the object's position."""
         for place in self.spec.observation.places:
             if place.name == "object":
                 return self.observation.state[place.first : place.first + 3].copy()

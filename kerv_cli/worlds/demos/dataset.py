@@ -33,10 +33,11 @@ class EpisodeEntry:
 
     Attributes:
         seed: Seed of the episode.
-        perturbed: Whether noise was added to the executed actions, or an actor moved the robot instead of the expert.
+        perturbed: Whether noise was added to the executed actions, or an actor (such as a policy) moved the robot
+            instead of the expert.
         steps: Number of control steps, up to the success.
-        bytes: Size of its file.
-        sha256: Hash of its file.
+        bytes: Size of the episode's file.
+        sha256: Hash of the episode's file.
     """
 
     seed: int
@@ -284,7 +285,7 @@ class DemoDataset:
         return cls(parts[0].path, replace(first, sha256=combined, config=config, tasks=tasks), episodes)
 
     def of_tasks(self, *tasks: str) -> list[int]:
-        """Return the positions in `episodes` of the episodes of some tasks, by their full names."""
+        """Return the indices in `episodes` of all episodes of some tasks. `tasks` are full names."""
         return [index for index, entry in enumerate(self.episodes) if entry.task in tasks]
 
     def load(self, index: int) -> DemoEpisode:

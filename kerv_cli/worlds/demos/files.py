@@ -45,7 +45,8 @@ _ARRAYS = {
 class DemoEpisode:
     """A demonstration of T control steps.
 
-    It ends with the first success. If an actor moved the robot, it may end without success.
+    The episode ends with the first success. If an actor (such as a policy) moved the robot instead of the expert, it
+    may end without success.
 
     Attributes:
         task: Full name of the task.
@@ -55,8 +56,8 @@ class DemoEpisode:
         frames: (n, size, size x views, 3) uint8, the recorded images.
         frame_steps: (n,) int64. Image i was drawn before the action of control step `frame_steps[i]`.
         states: (T, s) float32, privileged state before each action. It begins with the proprioception.
-        labels: (T + tail, D) float32, the expert's actions for D DoFs, clipped and without noise. The last `tail` ones
-            are those with which the expert went on after the episode's end.
+        labels: (T + tail, D) float32, the expert's actions for D DoFs, clipped and without noise. The expert executed
+            the last `tail` actions after the episode's end.
         executed: (T, D) float32, the actions that moved the robot.
         initial_state: (k,) float64, the world's `initial_state`, such as the placement of object and goal.
     """
@@ -260,7 +261,7 @@ class StreamedFrames:
 
     Attributes:
         shape: Shape of the decoded images, (n, height, width, 3).
-        images: Yields them, (height, width, 3) uint8.
+        images: Yields the decoded images, (height, width, 3) uint8.
     """
 
     shape: tuple[int, int, int, int]
@@ -274,14 +275,14 @@ def header_of(data: bytes) -> tuple[dict[str, Any], int]:
     """Return the header of a safetensors file, and the position at which its arrays begin.
 
     Args:
-        data: Bytes of the file. The header suffices.
+        data: Bytes of the file, at least up to the end of the header.
     """
     begin = LENGTH.size + LENGTH.unpack(data[: LENGTH.size])[0]
     return json.loads(data[LENGTH.size : begin]), begin
 
 
 def encode_png(frame: NDArray[np.uint8], level: int = 6) -> bytes:
-    """Return an image (height, width, 3) uint8 as a PNG file, see `save_episode`."""
+    """Return an image (height, width, 3) uint8 as a PNG file. `level` is the compression, from 1 (fast) to 9."""
     buffer = io.BytesIO()
     Image.fromarray(frame).save(buffer, format="PNG", compress_level=level)
     return buffer.getvalue()
@@ -302,7 +303,7 @@ def memory_limit(size: int) -> Iterator[None]:
     A file of any origin may need more than it states. Outside Linux this does nothing.
 
     Raises:
-        MemoryError: Inside the block, if more is needed.
+        MemoryError: The code inside the block needs more memory.
     """
     status = Path("/proc/self/statm")
     if not status.is_file():
@@ -320,7 +321,17 @@ def memory_limit(size: int) -> Iterator[None]:
 
 
 def foreign_table(source: Path | bytes, columns: Sequence[str] = (), most: int = 0) -> pa.Table:
-    """Read a table from a Parquet file of any origin, see `foreign_batches`."""
+    """Read a table from a Parquet file of any origin.
+
+    Args:
+        source: The file's path or its bytes.
+        columns: Names of the columns to read. Names that the file lacks are ignored. Empty: all columns.
+        most: Largest size of all rows in memory, in bytes. 0: MOST_EXPANDED.
+
+    Raises:
+        OSError: The file is missing or is no Parquet file.
+        ValueError: The file is damaged, or takes more than `most` bytes in memory.
+    """
     batches = list(foreign_batches(source, columns, most))
     return pa.Table.from_batches(batches[1:], batches[0].schema)
 

@@ -69,9 +69,9 @@ MOST_EPISODES = 2**18
 ALLOWED = 2**27
 """Bytes in memory that the rows, pictures or video frames of any file may take, however small it is."""
 ROWS_RATIO, PICTURES_RATIO, VIDEO_RATIO = 8, 64, 2048
-"""Bytes of rows, pictures and video frames in memory per byte of their file, if that is more than ALLOWED."""
+"""Bytes in memory that rows, pictures and video frames may take per byte of their file. Any file may take ALLOWED."""
 EPISODE_BYTES, FEW_EPISODES = 1024, 500
-"""Least size of an episode in its file, in bytes, and the number of episodes of which any file may hold."""
+"""A data file with more than FEW_EPISODES episodes is refused if it has fewer than EPISODE_BYTES bytes per episode."""
 _MOST_REWINDS = 10  # of a data file whose episodes are not in order
 _MEMORY = 3 * 2**29  # bytes, beyond what the process has
 # PIL raises SyntaxError
@@ -203,7 +203,7 @@ class Source:
         Args:
             episode: The episode's row in meta/episodes.
             table: The episode's rows.
-            limits: What the files of the dataset may take.
+            limits: Counts the memory that the images of each file take.
 
         Raises:
             CheckpointError: A file is missing or damaged, or its images take too much memory.
@@ -230,16 +230,16 @@ class Limits:
         self.taken: dict[Path, int] = {}
 
     def take(self, path: Path, size: int, ratio: int, what: str) -> None:
-        """Count `size` bytes of a file.
+        """Add `size` bytes to the memory that the images of a file take.
 
         Args:
             path: The file.
             size: Number of bytes in memory.
             ratio: How many bytes in memory are allowed per byte of the file.
-            what: What takes them, for the error message.
+            what: Which images take the memory, for the error message.
 
         Raises:
-            CheckpointError: The file takes more than that, and more than ALLOWED.
+            CheckpointError: The file's images take more memory than the ratio allows, and more than ALLOWED.
         """
         self.taken[path] = self.taken.get(path, 0) + size
         most = allowed(path, ratio)

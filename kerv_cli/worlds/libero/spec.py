@@ -8,7 +8,10 @@ from kerv_cli.worlds.spec import EnvironmentSpec, Seeds
 from kerv_cli.worlds.task import Task
 
 EXPERTS = "kerv 1"
-"""Name of the experts in recordings and in the identity of `policy=expert`. Raise it if their actions change."""
+"""Name of the experts in recordings and in the identity of `policy=expert`.
+
+It ends with a number. Increase the number if the experts' actions change.
+"""
 STATES = 50
 """Initial states that the benchmark has for each task."""
 _FIRST = 100_000

@@ -95,7 +95,10 @@ class PegInsertSide:
 
 
 VERSION = "kerv 1"
-"""Name of these experts in recordings and in the identity of `policy=expert`. Raise it if their actions change."""
+"""Name of these experts in recordings and in the identity of `policy=expert`.
+
+It ends with a number. Increase the number if the experts' actions change.
+"""
 
 OURS: Mapping[str, Callable[[], HandlePullSide | PegInsertSide]] = {
     "handle-pull-side-v3": HandlePullSide,

@@ -1,8 +1,8 @@
 """The 50 tasks of Meta-World v3: names, instructions, difficulty groups and suites.
 
-Meta-World's published instructions are the same for push and push-back. Those in `tasks.csv` all differ. They have at
-most ten lower-case words and describe what the experts do. Match tasks to published tables by name, not by position:
-the tables have other orders.
+Meta-World's published instructions are the same for push and push-back. The instructions in `tasks.csv` all differ.
+They have at most ten lower-case words and describe what the experts do. Match tasks to published tables by name, not by
+position: the tables have other orders.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Run Meta-World's tasks and scripted experts as kerv's worlds and experts.
 
 Meta-World ignores the seed in `env.reset(seed=...)`. The initial state alone determines an episode: the placement of
-object and goal (`rand_vec` in Meta-World). It is taken from Meta-World's benchmark `MT1(task, seed // 50)`.
+object and goal (`rand_vec` in Meta-World). Meta-World's benchmark `MT1(task, seed // 50)` has the initial states.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ class MetaWorldExpert:
         self._policy: Any = {**ENV_POLICY_MAP, **OURS}[name]()
 
     def __call__(self, observation: Observation) -> NDArray[np.float64]:
-        """Return the expert's action (4,), clipped to the limits. The controllers' raw output reaches 25."""
+        """Return the expert's action (4,), clipped to the limits. Without clipping, its numbers reach 25."""
         with _quiet_simulator():
             action = self._policy.get_action(observation.state)
         return np.clip(np.asarray(action, dtype=np.float64), *self._limits)

@@ -25,7 +25,8 @@ class StressPart(Part):
     """A kind of stress. The decorated class is a `Stress` (`kerv_cli/worlds/stress/base.py`).
 
     Args:
-        requires: What a world must allow for it, such as `actions`.
+        requires: What this kind of stress needs from an environment: entries of `World.stressable`, or `position` for
+            an action space with that group.
     """
 
     kind = "stress"

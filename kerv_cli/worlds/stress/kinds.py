@@ -124,9 +124,9 @@ class Objects(Stress):
     move freely and have no mesh. The friction of all geoms changes, not only that of objects, because a contact uses
     the larger of its two frictions. The damping of the objects' joints changes, too.
 
-    Each level is (size, mass, friction, spread). The first three are factors. In each episode a value is
-    multiplied by its factor, or divided by it, at random. `spread` widens the range of initial states around its
-    centre.
+    Each level is (size, mass, friction, spread). The first three are factors. In each episode, one random draw per
+    factor decides whether the values of all objects are multiplied by the factor or divided by it. `spread` is the
+    factor by which the range of initial states gets wider around its centre.
     """
 
     kind = "object"
