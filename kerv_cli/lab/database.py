@@ -367,7 +367,7 @@ class Database:
 def opened(results: str | Path) -> Database:
     """Return the database of a results folder that the running command uses.
 
-    It is the one that `store=` names, or else the variable KERV_STORE, or else the SQLite file in the folder. A command
+    It is the one that `store=` or else the variable KERV_STORE names, or else the SQLite file in the folder. A command
     calls this once and hands the database down.
     """
     return Database(results, current_store())

@@ -72,7 +72,7 @@ class Setting:
 
     @functools.cached_property
     def work(self) -> str:
-        """Hash of everything that determines a result, except task, seed and repeat."""
+        """Hash of the settings, weights and data that determine a result. Task, seed and repeat are not included."""
         return work_of(self.settings, self.identity)
 
     @functools.cached_property
@@ -139,7 +139,7 @@ class StoredEpisode:
     """An episode in the database that a study may reuse.
 
     Attributes:
-        id: Its row number.
+        id: Row number of the episode.
         success: Whether the task was solved.
         seconds: Wall time.
         block: Id of the block (episodes run by one process) in which it ran.

@@ -44,11 +44,11 @@ class BlockStarted:
 
 @dataclass(frozen=True)
 class Preparing:
-    """A worker builds the decoder of a setting, before the first episode of its block.
+    """A worker builds the decoder of a setting, before it runs the setting's first episode in a block.
 
     Attributes:
         setting: The setting.
-        number: Its place among the block's settings, from 1.
+        number: Position of the setting among the block's settings, from 1.
         of: Number of settings in the block.
     """
 
@@ -59,7 +59,7 @@ class Preparing:
 
 @dataclass(frozen=True)
 class BlocksWait:
-    """Other processes run all blocks that are left. The worker waits: if a process dies, its block is free again."""
+    """Other processes run all blocks (groups of episodes) that are left. The worker waits, in case one of them dies."""
 
 
 @dataclass(frozen=True)

@@ -36,14 +36,14 @@ PATIENCE_SECONDS = 120.0
 
 
 class ClaimLost(KervError):
-    """The block does not belong to this worker any more: it was silent for too long, or the study was deleted."""
+    """This worker has lost its block (group of episodes): its heartbeat was late, or the study was deleted."""
 
 
 def worker_id(pid: int, more: str = "") -> str:
     """Return the name of a process in the queue.
 
     Args:
-        pid: Its process id.
+        pid: Id of the process.
         more: Tells the workers of one process apart. Empty: the result is the prefix that all their names share.
     """
     return f"{socket.gethostname()}:{pid}:{more}"
@@ -95,10 +95,10 @@ def _is_free(connection: sa.Connection) -> sa.ColumnElement[bool]:
 
 @dataclass
 class Claim:
-    """A block that this worker runs.
+    """A block (group of episodes) that this worker runs.
 
     Attributes:
-        id: Its row number in the queue.
+        id: Row number of the block in the queue.
         run: Id of the command that planned it.
         about: Executor and workers of that command.
         block: The episodes to run.
@@ -115,7 +115,7 @@ class Claim:
 
 
 class Queue:
-    """The blocks of one study, as one worker sees them.
+    """The queued blocks (groups of episodes) of one study, as one worker sees them.
 
     Args:
         study: The study.
@@ -202,7 +202,7 @@ class Queue:
         """Return the settings of a row's episodes, by their hashes. They read this process's results folder.
 
         Raises:
-            KervError: This version of kerv computes other results than the one that planned.
+            KervError: This version of kerv computes other results than the version that planned the block.
         """
         works = {work for work, *_ in row.episodes}
         if new := works - self._settings.keys():

@@ -54,7 +54,7 @@ class ImportedEpisode:
     Attributes:
         episode: Setting, task, seed and repeat in the study.
         row: Columns of the table `episodes`, as far as they are known.
-        decodes: Its decodes, a table with the columns of rows.DECODE_SCHEMA.
+        decodes: Decodes of the episode, a table with the columns of rows.DECODE_SCHEMA.
         block: Id of the block (episodes that one process ran) in which it ran.
         about: Machine and versions that ran the block.
         run: Id of the run (the command that ran it). Empty: the run that imports it.
@@ -349,7 +349,7 @@ class Study:
     def frame(self, episodes: Iterable[Episode] | None = None, run: str | None = None) -> pd.DataFrame:
         """Return the episodes that have been run, in the study's order: one row per label, task, seed and repeat.
 
-        It has the columns of the table `episodes`, with `decode_seconds` as an array. Further columns are `run`,
+        Its columns are those of the table `episodes`, with `decode_seconds` as an array. Further columns are `run`,
         `code`, and the machine and versions that ran the episode.
 
         Args:

@@ -114,7 +114,7 @@ def checked(setting: Setting, tasks: list[str], results: str) -> Setting:
         The setting, changed to run in `results`.
 
     Raises:
-        CheckpointError: Its weights or data have changed.
+        CheckpointError: The weights or data of the setting have changed.
     """
     stored = {**setting.settings, "results": results}
     identity = check(settings_from({**stored, "task": tasks}))
@@ -207,7 +207,7 @@ class Detached(Interrupted):
 
 
 def run_blocks(study: Study, prepare: Prepare, record: Run, on_event: OnEvent) -> Outcome:
-    """Queue the blocks of a plan, and run them: in this process, in worker processes, or on a cluster.
+    """Queue the blocks (groups of episodes) of a plan. Run them in this process, in worker processes or on a cluster.
 
     When this function returns or raises, no process of this machine runs the plan's blocks any more. No block stays
     queued, unless the workers of a cluster go on without this command. They also go on if this process is killed.
@@ -257,7 +257,7 @@ def _follow_cluster(array: Array, progress: Progress) -> None:
 
 
 def work_on(study: Study, run_id: str, on_event: OnEvent, save: Save) -> None:
-    """Run blocks of a study that a sweep has planned, until none is left. For `kerv work`.
+    """Run blocks (groups of episodes) that a sweep of the study has queued, until none is left. For `kerv work`.
 
     Args:
         study: The study.

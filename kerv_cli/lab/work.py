@@ -47,7 +47,7 @@ Prepare = Callable[[Setting, str], RunEpisode]
 
 
 def work(queue: Queue, prepare: Prepare, on_event: OnEvent = lambda event: None) -> None:
-    """Run the blocks of a queue until none is left.
+    """Claim and run the blocks (groups of episodes) of a queue, one after another, until none is left.
 
     If a setting fails, it is reported and the other settings go on. While other workers run all blocks that are left,
     wait: if one of them dies, its block is free again.

@@ -99,7 +99,7 @@ def disturbances(study: Study) -> list[str]:
 
 
 def follow(queue: Queue, progress: Progress, tend: Callable[[], None]) -> None:
-    """Wait until every block of a queue has ended, and show the progress of the processes that run them.
+    """Wait until every block (group of episodes) of a queue has ended. Show the progress of the workers that run them.
 
     Args:
         queue: The blocks.
@@ -266,7 +266,7 @@ class Array:
         return printed.strip().partition(";")[0]
 
     def tend(self, progress: Progress) -> None:
-        """Submit another array if all jobs have ended, for example because their time was over, but blocks are left.
+        """Submit another array if all jobs have ended, for example at their time limit, but some episodes are left.
 
         Raises:
             KervError: The jobs have ended without a single episode.
