@@ -221,7 +221,7 @@ def _other_study(target: str, store: Study, episodes: Sequence[Episode]) -> str:
 
 
 def certify(certificate: Certificate, store: Study, wanted: Sequence[Episode], baseline: str) -> Certificate:
-    """Test the candidates in their order, each at level delta, until one fails.
+    """Test the candidates (the settings other than AR) in their order, each at level delta, until one fails.
 
     Return the certificate with the results. By fixed-sequence testing, the probability that any certified setting
     loses more than `margin` points is at most delta. Nothing is tested if AR solves less than half of its episodes.

@@ -26,7 +26,8 @@ class Choice:
 
     Attributes:
         where: The task, or `all tasks`.
-        pairs: Number of pairs of the setting with the most pairs.
+        pairs: Number of pairs of the setting with the most pairs. A pair is one episode of the baseline and one of the
+            setting, from the same initial state.
         baseline_success: Success rate of the baseline.
         front: Settings that no other setting beats in both speed and success, the fastest first.
         chosen: Fastest setting that is shown to lose less success than the bound. Empty if there is none.

@@ -42,7 +42,7 @@ def explained(label: str, method: str = "") -> str:
 
     Args:
         label: The setting's label, such as `spec_vla chain`.
-        method: Its method, such as `spec_vla`. Empty: the label's first word.
+        method: The setting's method, such as `spec_vla`. Empty: the label's first word.
     """
     method = method or re.split(r"[ ,]", label)[0]
     family = max((name for name in METHODS if method == name or method.startswith(f"{name}_")), key=len, default="")

@@ -53,7 +53,7 @@ class Report:
 
     Attributes:
         data: The study with its tables.
-        priced: Its speeds on other machines. Empty: none were estimated.
+        priced: The study's speeds on other machines. Empty: none were estimated.
         files: Written files, in the order of writing.
     """
 

@@ -33,11 +33,11 @@ _COLUMNS = ("index", "rounds", "similarity", *(f"seconds.{phase}" for phase in R
 
 @dataclass(frozen=True)
 class Priced:
-    """How fast a setting would be on the machine of a profile.
+    """How fast a setting would be on another machine, estimated from a cost profile (file of `kerv bench`).
 
     Attributes:
         result: The setting's row as measured, pooled over tasks.
-        machine: The profile.
+        machine: The cost profile of the other machine.
         measures: The measures of `result`, estimated for the machine.
         encoders: Estimated speeds per episode with another encoder, by `ENCODERS`. Empty for measured profiles.
     """
@@ -62,7 +62,7 @@ class Priced:
 
 
 def prices_table(priced: Iterable[Priced]) -> pd.DataFrame:
-    """Return estimates as a data frame: one row per profile and setting."""
+    """Return the estimated speeds as a data frame: one row per machine and setting."""
     return pd.DataFrame(row.columns for row in priced)
 
 
@@ -129,7 +129,7 @@ def prices_on(data: StudyData, names: Iterable[str]) -> list[Priced]:
 def own_profiles(data: StudyData) -> list[str]:
     """Return the names of the profiles that `kerv bench` measured of the study's targets on the study's machines.
 
-    Their estimates, beside what was measured, show how far the cost model is from the truth.
+    Estimates from these profiles, beside the measured times, show how far the cost model is from the truth.
     """
     devices, names = set(data.episodes["device_name"]), []
     for one in data.settings.values():

@@ -140,7 +140,8 @@ def difference(first: Estimate, second: Estimate) -> Estimate:
 def pairs_for_power(lost: float, won: float, power: float = 0.8) -> float:
     """Return about how many pairs McNemar's exact test needs to show a difference at the 5 % level.
 
-    A pair is discordant if exactly one of the two succeeds. The number of discordant pairs is treated as random.
+    A pair is one episode of the baseline and one of the method, from the same initial state. It is discordant if
+    exactly one of the two succeeds. The number of discordant pairs is treated as random.
 
     Args:
         lost: Expected share of pairs in which only the baseline succeeds.

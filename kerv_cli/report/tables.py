@@ -218,7 +218,7 @@ def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyDa
 
     Args:
         study: The study, named or loaded.
-        wanted: Episodes to read. Settings without any of them are left out. None: read everything.
+        wanted: Episodes to read. Settings without any of them are left out. None: read all episodes.
 
     Raises:
         UsageError: There is no such study, or none of its episodes is stored.

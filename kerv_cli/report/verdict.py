@@ -112,7 +112,7 @@ def unsolved(baseline: str, success: float) -> str:
 
     Args:
         baseline: Label of the baseline.
-        success: Its success rate, from 0 to 1.
+        success: Success rate of the baseline, from 0 to 1.
     """
     return (
         f"{baseline} does not solve these tasks ({100 * success:.0f} % of its episodes succeed), so no setting is "

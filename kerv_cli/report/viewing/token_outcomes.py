@@ -212,7 +212,7 @@ def decode_table(
 
     Args:
         decode: The decode.
-        number: Its number in the episode, from 0.
+        number: Number of the decode in the episode, from 0.
         step: Control step at which its first action is executed.
         outcomes: Outcome of each token of its chunk.
         names: Names of the D DoFs.
