@@ -64,7 +64,7 @@ class RunEntry:
         done: How many of the planned ones are finished.
         left: While it runs, the estimated remaining time, such as `about 3 min left`.
         message: Why the newest command that makes it failed.
-        figures: Its main numbers by name, such as the success rate.
+        figures: Main results of the entry by name, such as the success rate.
         command: Command-line arguments (without `kerv`) that made it. Empty if unknown.
         sha256: Hash by which other artifacts refer to it.
         made_from: Hashes of the artifacts that it was made from, by kind. If settings of a study use different
@@ -407,7 +407,7 @@ def check_removable(run: RunEntry) -> None:
     """Refuse to remove an entry that is in use.
 
     Raises:
-        UsageError: Its folder is a symbolic link, or a process is making it.
+        UsageError: The entry's folder is a symbolic link, or a process is making the entry.
     """
     if run.folder.is_symlink():
         raise UsageError(f"{run.folder} is a link to {os.readlink(run.folder)}: remove the link, or what it points to")

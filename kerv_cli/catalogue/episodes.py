@@ -69,7 +69,7 @@ class FoundEpisode:
     """A stored episode, and the newest study that uses it.
 
     Attributes:
-        id: Its row number.
+        id: Row number of the episode.
         store: The study.
         episode: Setting, task, seed and repeat.
         row: Columns of the table `episodes`, without `decode_seconds`, and of its setting.
@@ -103,7 +103,7 @@ def find_episode(database: Database, number: int) -> FoundEpisode:
 
     Args:
         database: The database.
-        number: Its row number.
+        number: Row number of the episode.
 
     Raises:
         UsageError: There is no such episode, or no study uses it any more, because it was run again.

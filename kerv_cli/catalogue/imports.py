@@ -38,7 +38,7 @@ class Found:
     """A study that can be imported.
 
     Attributes:
-        study: Its settings and the list of all planned episodes.
+        study: The study, with its settings and the list of all planned episodes.
         episodes: Yields the episodes that were run, with their results.
         command: Command-line arguments (without `kerv`) that ran it. Empty if unknown.
     """
