@@ -143,7 +143,7 @@ def latency_of(settings: RolloutSettings, target: TargetDescription | None) -> L
 
 
 def profiled(profile: Profile, scale: float = 1.0) -> Latency:
-    """Return a function that returns the seconds which a decode would take by `profile`, multiplied by `scale`."""
+    """Return a function that computes the latency of a decode from the costs in `profile`, multiplied by `scale`."""
     return lambda decode: scale * float(prices(work_of_record(decode), profile)[0])
 
 

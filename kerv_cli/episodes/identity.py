@@ -65,11 +65,11 @@ LATER: Mapping[str, Any] = {"threshold.over": "compared", "threshold.total": Fal
 
 
 def work_of(settings: Plain, identity: Identity, engine: int = ENGINE) -> str:
-    """Return the hash of everything that determines a setting's results, except task, seed and repetition.
+    """Return the hash of what determines a setting's results: settings, weights and data. Task and seed are left out.
 
     Args:
         settings: The rollout's settings as nested plain values.
-        identity: Hashes of its weights and data, as `policy.check` returns them.
+        identity: Hashes of the setting's weights and data, as `policy.check` returns them.
         engine: Version of the decoding, see `ENGINE`.
     """
     determining = without(settings, NOT_DETERMINING - {"policy", "method"})
@@ -116,9 +116,9 @@ def _drop(settings: dict[str, Any], path: Sequence[str]) -> None:
 
 
 def depends_on_order(settings: Plain) -> bool:
-    """Return whether an episode's result depends on the episodes before it in its block.
+    """Return whether an episode's result depends on the episodes that its process ran before.
 
-    This is so if a skip rule adapts its similarity threshold after each episode (`skip.up`, `skip.down`).
+    It does if a skip rule adapts its similarity threshold after each episode (`skip.up`, `skip.down`).
     """
     skip = settings["skip"]
     return bool(skip.get("up") or skip.get("down"))
