@@ -47,7 +47,7 @@ def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Beg
         UsageError: A setting belongs to another kind of drafter, or only to the training of targets.
         CheckpointError: The target or the demonstrations do not exist or are damaged. Or the folder holds another
             training.
-        KervError: See `fit`.
+        KervError: The training diverged.
     """
     drafter, train = drafter_of(settings), settings.train
     artifacts = Artifacts(settings.results, settings.policy)

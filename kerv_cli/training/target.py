@@ -57,7 +57,7 @@ def train_target(settings: TrainTargetSettings, database: Database, begin: Begin
         UsageError: Some settings contradict each other.
         CheckpointError: The demonstrations or the target `train.init` do not exist or are damaged. Or the
             demonstrations have another environment, camera or other tasks. Or the folder holds another training.
-        KervError: See `fit`.
+        KervError: The training diverged.
     """
     folder, train = artifact(settings.results, "target", settings.name), settings.train
     refuse_contradictions(settings)
@@ -168,7 +168,7 @@ def initial_target(settings: TrainTargetSettings, camera: str, new: Path) -> Pat
 
     Raises:
         UsageError: The training would overwrite that target, or its shapes differ.
-        CheckpointError: That target does not exist.
+        CheckpointError: The target `train.init` does not exist.
     """
     name = settings.train.init
     if name is None:
@@ -214,7 +214,7 @@ def load_training(
 def state_range(dataset: DemoDataset) -> list[list[float]]:
     """Return the range of each of the s numbers of a state: 0.1th percentiles (s,), then 99.9th percentiles (s,).
 
-    They are measured on at most STATE_EPISODES episodes.
+    The percentiles are measured on at most STATE_EPISODES episodes.
     """
     count = len(dataset.episodes)
     chosen = range(0, count, -(-count // STATE_EPISODES))
