@@ -38,7 +38,7 @@ class WorldSettings:
 class StressSettings:
     """Settings of a stress: a disturbance of known size (docs/stress.md).
 
-    It is drawn for every episode from task, seed, kind and level.
+    The disturbance of an episode is drawn from task, seed, kind and level.
     """
 
     kind: str = setting("none", "what is disturbed: push, actuation, sensor, light, colour, camera or object")

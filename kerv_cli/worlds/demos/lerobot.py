@@ -283,7 +283,7 @@ class DataFile:
 
         Args:
             episode: Number of the episode.
-            length: Its number of rows.
+            length: Number of rows of the episode.
 
         Raises:
             CheckpointError: Rows are missing, or the file is damaged.

@@ -350,8 +350,8 @@ def is_perturbed(seed: int, fraction: float) -> bool:
 class Perturbation:
     """Noise for the actions of one episode.
 
-    It is Gaussian noise and, now and then, a burst: 3 to 8 control steps in one random direction. Strict DoFs (such as
-    a gripper) get no noise.
+    The noise is Gaussian. Now and then, for 3 to 8 control steps, a burst in one random direction replaces the action.
+    Strict DoFs (such as a gripper) are not changed.
 
     Attributes:
         sigma: Standard deviation of the Gaussian noise in this episode, where 1 is half of a DoF's range.
