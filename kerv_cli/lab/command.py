@@ -27,10 +27,10 @@ def current_store() -> str:
 
 @contextlib.contextmanager
 def noted(words: Sequence[str]) -> Iterator[None]:
-    """Remember a command's arguments (without `kerv`) inside this `with` block, to store them with what it makes.
+    """Note a command's arguments (without `kerv`) during a `with` block. What is made in the block is stored with them.
 
-    At the end the arguments from before the block are remembered again, because `kerv prepare` runs other commands
-    inside its own.
+    At the end of the block the earlier arguments are restored, because `kerv prepare` runs other commands inside its
+    own.
     """
     before = _words.set(tuple(words))
     try:

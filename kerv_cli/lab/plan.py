@@ -161,7 +161,7 @@ class StoredEpisode:
 
 @dataclass(frozen=True)
 class Block:
-    """Episodes that one process runs: one task and one repeat. The settings take turns, seed by seed.
+    """Episodes of one task and one repeat, which one process runs. The settings take turns, seed by seed.
 
     A block that runs as a batch (several episodes at once) has a single setting instead, and any tasks and seeds.
     """
