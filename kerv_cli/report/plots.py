@@ -47,7 +47,7 @@ def study_figures(results: Sequence[Result], axis: str, loss: float = 3.0) -> di
     """Draw the chart that suits a study, from its rows pooled over tasks.
 
     - A study of stress: success against the level of stress.
-    - A study whose settings differ along `axis`: speed and success against it.
+    - A study whose settings differ along `axis`: speed and success against the value of that column.
     - Any other study that compares settings or was timed: speed and change in success of every setting.
 
     Args:
