@@ -65,7 +65,7 @@ LATER: Mapping[str, Any] = {"threshold.over": "compared", "threshold.total": Fal
 
 
 def work_of(settings: Plain, identity: Identity, engine: int = ENGINE) -> str:
-    """Return the hash of what determines a setting's results: settings, weights and data. Task and seed are left out.
+    """Return the hash of the settings, weights and data that determine results. Task, seed and repeat are left out.
 
     Args:
         settings: The rollout's settings as nested plain values.
@@ -116,7 +116,7 @@ def _drop(settings: dict[str, Any], path: Sequence[str]) -> None:
 
 
 def depends_on_order(settings: Plain) -> bool:
-    """Return whether an episode's result depends on the episodes that its process ran before.
+    """Return whether an episode's result depends on the episodes before it in its block (group that one process runs).
 
     It does if a skip rule adapts its similarity threshold after each episode (`skip.up`, `skip.down`).
     """

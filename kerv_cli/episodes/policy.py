@@ -131,7 +131,7 @@ def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:
 
 
 def still_observation(decoder: ActionDecoder, space: ObservationSpace, pixels: int) -> Observation:
-    """Return an observation in which all values that the decoder reads are 0. Images have `pixels` × `pixels` pixels."""
+    """Return an observation in which all that the decoder reads is 0. Images have `pixels` × `pixels` pixels."""
     images = {name: np.zeros(frame_shape(name, pixels), dtype=np.uint8) for name in decoder.cameras}
     return Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
 
