@@ -24,8 +24,8 @@ def setting(default: Any, help: str = "", **metadata: Any) -> Any:
     Args:
         default: The default value, or a function (such as a dataclass) that makes it.
         help: Description for `--help` and `--cfg`, one line.
-        **metadata: Further facts about the field. `limits`: result of the function `limits`. `names`: the allowed
-            values. `group`: for a field that is named like a folder of conf/, the file that is chosen by default.
+        **metadata: Further facts about the field. `limits`: what the function `limits` returns under this key. `names`:
+            the allowed values. `group`: for a field with the name of a folder of conf/, the file chosen by default.
     """
     metadata |= {"help": help} if help else {}
     if callable(default):
