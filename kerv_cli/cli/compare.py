@@ -1,4 +1,4 @@
-"""`kerv compare` and `kerv power`: compare two success counts, and say how many pairs a comparison needs."""
+"""Compare two success counts (`kerv compare 17/20 14/20`), and say how many pairs a comparison needs."""
 
 from __future__ import annotations
 
