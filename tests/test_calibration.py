@@ -23,6 +23,7 @@ from mock_target import SEVEN
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import read_json, sha256_of, write_json
+from kerv_cli.base.paths import find_target
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
 from kerv_cli.engine.record import Measure, Round
@@ -43,7 +44,6 @@ from kerv_cli.methods.heisd.datastore import Datastore
 from kerv_cli.methods.kerv.prediction import PREDICTORS, Noise
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.checkpoint import TargetDescription, read_target
-from kerv_cli.targets.folders import find_target
 from kerv_cli.training.calibration import (
     LEAST,
     Matches,

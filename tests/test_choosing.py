@@ -8,10 +8,18 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 
-from kerv_cli.report.decide import choices, pareto, safest_first, with_matched_speed
 from kerv_cli.report.results import MICRO, Measures, Result
 from kerv_cli.report.statistics import NO_ESTIMATE, Estimate, PairedCounts, paired_difference, pairs_to_settle, wilson
-from kerv_cli.report.verdict import episodes_to_settle, order_of, sentence, short_sentence
+from kerv_cli.report.verdict import (
+    choices,
+    episodes_to_settle,
+    order_of,
+    pareto,
+    safest_first,
+    sentence,
+    short_sentence,
+    with_matched_speed,
+)
 
 T = TypeVar("T", Measures, Result)
 UNKNOWN = {"str": "", "int": 0, "bool": False, "float": math.nan, "Estimate": NO_ESTIMATE}

@@ -16,6 +16,7 @@ from mock_target import SEVEN
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.paths import find_target, shipped_dir
 from kerv_cli.base.registry import find
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
 from kerv_cli.engine.decoder import Decoder, Parts
@@ -35,7 +36,6 @@ from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Trunk
-from kerv_cli.targets.folders import find_target, shipped_dir
 from kerv_cli.targets.grown import grow_stack
 from kerv_cli.targets.settings import GrowSettings
 from kerv_cli.training.imitation import check_init, continued_target

@@ -14,13 +14,12 @@ import kerv_cli.cli.app  # noqa: F401 - registers the commands
 from kerv_cli.base.config import _composed, compose, conf_dir, expand, groups, swept_keys
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import check_label, check_settings, description
-from kerv_cli.base.paths import artifact
+from kerv_cli.base.paths import artifact, find_target
 from kerv_cli.base.registry import PART_GROUPS, SETTINGS_GROUPS, NoSettings, part_of, parts
 from kerv_cli.cli.common import settings_yaml
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.compose import Method
-from kerv_cli.targets.folders import find_target
 from kerv_cli.training.preparation import needs
 
 SCHEMAS = {

@@ -13,6 +13,7 @@ from command import kerv, refusal, told
 from examples import trace_of_log
 from studies_synthetic import swept, threshold_study
 
+from kerv_cli.base.paths import shipped_dir
 from kerv_cli.bench.described import described, language_of
 from kerv_cli.bench.expected import TABLES, Decodes, Drafts, recorded
 from kerv_cli.bench.physics import DEVICES, ENGINES, SHAPES, Sizes, priced
@@ -25,7 +26,6 @@ from kerv_cli.lab.store import Study
 from kerv_cli.report.profiles import open_profiles
 from kerv_cli.report.reprice import prices_table, repriced
 from kerv_cli.report.tables import load_study
-from kerv_cli.targets.folders import shipped_dir
 
 ROOT = Path(__file__).resolve().parent.parent
 OPENVLA = priced(SHAPES["openvla-7b"], DEVICES["a100"], ENGINES["eager"])

@@ -16,15 +16,14 @@ import sqlalchemy as sa
 from command import kerv, told
 from test_calibration import write_dataset
 
-from kerv_cli.base import files
+from kerv_cli.base import files, paths
 from kerv_cli.base.config import conf_dir
 from kerv_cli.base.files import read_yaml_lines
+from kerv_cli.base.paths import RESUME
 from kerv_cli.episodes.resolve import resolve, resolve_rollout
 from kerv_cli.lab.database import RUNS, opened
 from kerv_cli.lab.runs import run_rows
 from kerv_cli.report.plots import read_log
-from kerv_cli.targets import folders
-from kerv_cli.targets.folders import RESUME
 from kerv_cli.training.preparation import needs
 from kerv_cli.worlds import resolve_tasks
 
@@ -270,11 +269,11 @@ def test_drafts_of_seven_tasks_are_made_as_the_note_of_their_study_says(policies
 
 def test_the_released_policies_are_those_of_a_checkout():
     shipped = Path(__file__).resolve().parents[1].glob("results/pretrained/*/target/target.json")
-    assert sorted(path.parts[-3] for path in shipped) == sorted(folders.RELEASED)
+    assert sorted(path.parts[-3] for path in shipped) == sorted(paths.RELEASED)
 
 
 def test_the_printed_command_installs_a_policy_that_the_wheel_leaves_out(policies, tmp_path, monkeypatch):
-    monkeypatch.setattr(folders, "shipped_dir", lambda: tmp_path / "nothing")
+    monkeypatch.setattr(paths, "shipped_dir", lambda: tmp_path / "nothing")
     for kind in ("target", "drafter"):
         shutil.copytree(policies / "artifacts" / kind / "nano-vision", tmp_path / "release/mt50-vision" / kind)
     with tarfile.open(tmp_path / "mt50-vision.tar.gz", "w:gz") as file:
@@ -284,4 +283,4 @@ def test_the_printed_command_installs_a_policy_that_the_wheel_leaves_out(policie
     assert printed
     subprocess.run(printed[1], shell=True, cwd=tmp_path, check=True)
     assert "1 task, 3 episodes" in told(*words)
-    assert "mt50-vision" in folders.target_names(f"{tmp_path}/results")
+    assert "mt50-vision" in paths.target_names(f"{tmp_path}/results")

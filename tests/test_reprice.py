@@ -215,8 +215,8 @@ def test_what_is_not_there_is_refused(results):
 
 
 def test_shipped_profiles_can_price_what_ships(tmp_path):
+    from kerv_cli.base.paths import shipped_dir
     from kerv_cli.engine.cost import FORWARDS, read_profile, source_costs
-    from kerv_cli.targets.folders import shipped_dir
 
     shipped = sorted((shipped_dir().parent / "bench").glob("*.json"))
     for path in shipped:

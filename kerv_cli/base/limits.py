@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import re
 from dataclasses import Field, field, fields, is_dataclass
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -13,9 +12,6 @@ from kerv_cli.base.errors import UnknownName, UsageError
 MOST_TOKENS = 65_536  # limit of settings that count tokens of a draft or nodes of its tree
 MOST_BINS = 65_536  # limit of settings that are distances between tokens
 MOST_DECODES = 1_000_000  # limit of settings that count decodes of an episode
-
-PLAIN_NAME = re.compile(r"\w[\w.+-]{0,199}")
-"""Pattern of names that can be used for a folder in the results folder: no slash, no leading dot."""
 
 
 def setting(default: Any, help: str = "", **metadata: Any) -> Any:
@@ -76,23 +72,6 @@ def description(at: Field[Any]) -> str:
 def range_of(at: Field[Any]) -> str:
     """Return the values that a setting may have, as in `from 1 to 1024`. Empty if it has no limits."""
     return _range_text(*at.metadata["limits"]) if "limits" in at.metadata else ""
-
-
-def check_name(name: str, what: str) -> str:
-    """Check that a name can be used for a folder, and return it.
-
-    Args:
-        name: The name.
-        what: What is named, text for the error message.
-
-    Raises:
-        UsageError: The name contains other characters than PLAIN_NAME allows.
-    """
-    if not PLAIN_NAME.fullmatch(name):
-        raise UsageError(
-            f"{what} '{name}' must be letters, digits, '_', '-', '+', '.' and begin with a letter or a digit"
-        )
-    return name
 
 
 def check_label(label: str) -> str:

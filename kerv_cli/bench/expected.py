@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from kerv_cli.base.files import read_json
+from kerv_cli.base.paths import shipped_dir
 from kerv_cli.base.registry import DRAFTING
 from kerv_cli.engine.cost import Profile
-from kerv_cli.targets.folders import shipped_dir
 
 _TOP = 8  # children of a node, and kept nodes of a level, in EAGLE-2's tree
 _STEPS = 20  # halvings of an interval until a search ends

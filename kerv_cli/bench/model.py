@@ -10,6 +10,7 @@ import torch
 
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.paths import find_target, target_names
 from kerv_cli.base.runtime import DTYPES, set_up
 from kerv_cli.base.spaces import Observation
 from kerv_cli.bench.physics import Sizes
@@ -25,7 +26,6 @@ from kerv_cli.targets.compact.program import stored_bytes
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import Layer
-from kerv_cli.targets.folders import find_target, target_names
 from kerv_cli.training.imitation import vocabulary
 from kerv_cli.training.settings import TrainTargetSettings
 from kerv_cli.worlds.metaworld.spec import SPEC

@@ -23,6 +23,7 @@ from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.files import read_mapping, read_text, sha256_of, storage_errors, sync, visible
 from kerv_cli.base.leftovers import clean, temporary_beside
 from kerv_cli.base.manifests import content_of
+from kerv_cli.base.paths import shipped_dir
 from kerv_cli.base.registry import ArtifactPart
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.catalogue.labels import labels_in, set_labels
@@ -31,7 +32,6 @@ from kerv_cli.lab.database import EPISODES, SETTINGS, STUDIES, WANTED, Database
 from kerv_cli.lab.plan import ALL, Episode
 from kerv_cli.lab.runs import COMPLETE, RUNNING, RunRow, forget, interrupted, run_rows, time_left
 from kerv_cli.lab.store import IMPORT, ROLLOUT, SWEEP, Study
-from kerv_cli.targets.folders import shipped_dir
 
 LOG, WEIGHTS = "log.csv", "model.safetensors"
 """Names of a training's files: validation results, weights."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.paths import artifact
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, print_figures
-from kerv_cli.cli.making import as_planned
+from kerv_cli.cli.common import AsJson, ShowPlan, as_planned, print_figures
 from kerv_cli.targets import TargetPart
 from kerv_cli.targets.settings import BuildTargetSettings
 from kerv_cli.training.settings import BuildDatastoreSettings, BuildDrafterSettings

@@ -8,8 +8,7 @@ import typer
 
 from kerv_cli.base.config import compose
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, end_with_json, print_rows, print_table, settings_yaml
-from kerv_cli.cli.making import as_planned
+from kerv_cli.cli.common import AsJson, ShowPlan, as_planned, end_with_json, print_rows, print_table, settings_yaml
 from kerv_cli.episodes.settings import SweepSettings
 from kerv_cli.training.settings import CalibrateSettings, CalibrateSuccessSettings
 

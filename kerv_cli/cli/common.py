@@ -9,8 +9,9 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
@@ -21,7 +22,9 @@ from kerv_cli.base.limits import description
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from kerv_cli.lab.database import Database
     from kerv_cli.lab.runs import Run
+    from kerv_cli.training.settings import Begin, Stage
 
 ShowPlan = Annotated[bool, typer.Option("--plan", help="Print what would be done and how long it takes, and stop.")]
 
@@ -200,6 +203,33 @@ def with_results(message: str, words: Iterable[str]) -> str:
         return f"{quote}{command}{where if is_elsewhere else ''}{quote}"
 
     return re.sub(r"(['`])(kerv [a-z].*?)\1(?!\w)", complete, message)
+
+
+@contextmanager
+def as_planned(database: Database, plan: bool = False, as_json: bool = False) -> Iterator[Begin]:
+    """Open a `with` block in which an artifact is made. At the end of the block, store in the database how it ended.
+
+    Args:
+        database: The database of the results folder.
+        plan: Print what would be made, and how long it takes, and end the command.
+        as_json: Print the plan as JSON.
+
+    Yields:
+        A function that the code in the block calls once the settings are checked. It writes the command's row in the
+        database. With `plan` it prints the plan instead.
+    """
+    from kerv_cli.lab import runs
+    from kerv_cli.lab.command import current_command
+
+    with ExitStack() as stack:
+
+        def begin(kind: str, folder: Path, what: str, units: int) -> Stage:
+            if plan:
+                end_with_plan(f"{what}, {runs.time_of(database, kind, current_command(), units)}", as_json)
+            run = stack.enter_context(runs.making(database, kind, folder))
+            return lambda title: progress_bar(title, run)
+
+        yield begin
 
 
 @contextmanager

@@ -8,8 +8,7 @@ from kerv_cli.base.durations import count
 from kerv_cli.base.errors import Interrupted, UsageError
 from kerv_cli.base.paths import artifact
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import ShowPlan, print_table, progress_bar
-from kerv_cli.cli.making import as_planned
+from kerv_cli.cli.common import ShowPlan, as_planned, print_table, progress_bar
 from kerv_cli.training.settings import DemosSettings
 from kerv_cli.worlds.settings import DemosImportSettings
 

@@ -13,12 +13,11 @@ import typer
 from kerv_cli.base.errors import UnknownName
 from kerv_cli.base.files import visible
 from kerv_cli.base.limits import number, setting
-from kerv_cli.base.paths import check_writable, results_dir
+from kerv_cli.base.paths import check_writable, find_target, results_dir, shipped_dir
 from kerv_cli.base.settings import RunSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, end_with_json, print_table
 from kerv_cli.methods.settings import PolicySettings
-from kerv_cli.targets.folders import find_target, shipped_dir
 from kerv_cli.worlds.findings import Finding, find, need
 from kerv_cli.worlds.settings import EVALUATION_SEED, WorldSettings
 

@@ -74,8 +74,7 @@ def unsolved_by(settings: PrepareSettings) -> str:
     """Return a sentence if the test for the certificate has shown that the policy does not solve its tasks, else ""."""
     from kerv_cli.methods.artifacts import Artifacts
     from kerv_cli.methods.certified.certificate import CertificateArtifact
-    from kerv_cli.report.decide import SOLVED
-    from kerv_cli.report.verdict import unsolved
+    from kerv_cli.report.verdict import SOLVED, unsolved
 
     artifact = CertificateArtifact()
     path = Artifacts(settings.results, settings.policy).path(artifact.kind)

@@ -103,10 +103,9 @@ def _as_json(reports: list[Report]) -> dict[str, object]:
 
 def _print_choice(database: Database, study: str | None, loss: float, as_json: bool) -> None:
     """Print which setting to use in the chosen study, or in each study with results."""
-    from kerv_cli.report.decide import choices
     from kerv_cli.report.report import to_report
     from kerv_cli.report.tables import load_study
-    from kerv_cli.report.verdict import sentence, short_sentence
+    from kerv_cli.report.verdict import choices, sentence, short_sentence
 
     answers = {}
     for store in to_report(database, study):

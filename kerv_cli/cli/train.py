@@ -9,8 +9,7 @@ from typing import Any
 import typer
 
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, end_with_json, print_figures
-from kerv_cli.cli.making import as_planned
+from kerv_cli.cli.common import AsJson, ShowPlan, as_planned, end_with_json, print_figures
 from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
 
 

@@ -12,11 +12,11 @@ from kerv_cli.base.config import compose, expand, preset_file, split, swept_keys
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.files import read_yaml_lines
 from kerv_cli.base.limits import check_label
+from kerv_cli.base.paths import find_target
 from kerv_cli.base.registry import METHOD_KINDS
 from kerv_cli.episodes.identity import flat, without_effect
 from kerv_cli.episodes.settings import DEFAULT_TASKS, RolloutSettings, StudySettings, SweepSettings
 from kerv_cli.methods.settings import EXPERT
-from kerv_cli.targets.folders import find_target
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
 
 MOST_SEEDS = 10_000

@@ -15,7 +15,8 @@ import sqlalchemy as sa
 
 from kerv_cli.base.config import groups
 from kerv_cli.base.errors import UsageError, did_you_mean
-from kerv_cli.base.limits import check_label, check_name
+from kerv_cli.base.limits import check_label
+from kerv_cli.base.paths import check_name
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.lab.database import (
     BLOCKS,

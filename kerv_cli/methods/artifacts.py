@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+from kerv_cli.base.config import command_of_a_study
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import sha256_of
-from kerv_cli.base.limits import check_name
 from kerv_cli.base.manifests import check_files, read_file
-from kerv_cli.base.paths import artifact_or_path
+from kerv_cli.base.paths import artifact_or_path, beside, check_name, check_not_shipped, find_target
 from kerv_cli.base.registry import ArtifactPart
 from kerv_cli.base.runtime import DTYPES
 from kerv_cli.base.spaces import ActionSpace
@@ -23,7 +23,6 @@ from kerv_cli.engine.protocol import Target
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets import checkpoint
 from kerv_cli.targets.checkpoint import TargetDescription
-from kerv_cli.targets.folders import beside, check_not_shipped, command_of_a_study, find_target
 
 TARGET = "target"
 

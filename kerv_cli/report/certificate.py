@@ -21,7 +21,7 @@ import sqlalchemy as sa
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_json
-from kerv_cli.base.paths import results_dir
+from kerv_cli.base.paths import beside, results_dir
 from kerv_cli.base.registry import METHOD_KINDS
 from kerv_cli.episodes.identity import ENGINE
 from kerv_cli.episodes.policy import artifacts_of
@@ -35,7 +35,6 @@ from kerv_cli.methods.compose import Method
 from kerv_cli.report.betting import p_value
 from kerv_cli.report.measures import paired
 from kerv_cli.report.tables import load_study
-from kerv_cli.targets.folders import beside
 from kerv_cli.targets.provenance import provenance
 from kerv_cli.training.settings import CalibrateSuccessSettings
 from kerv_cli.worlds import resolve_tasks, spec_of

@@ -11,6 +11,7 @@ import pandas as pd
 
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.files import atomic_path, read_mapping, write_text
+from kerv_cli.base.paths import find_target
 from kerv_cli.catalogue.entries import RunEntry, store_of
 from kerv_cli.catalogue.imports import export_database
 from kerv_cli.engine.cost import READ_PHASES
@@ -21,7 +22,6 @@ from kerv_cli.lab.store import Study
 from kerv_cli.report.reprice import levels_of
 from kerv_cli.report.results import csv_text
 from kerv_cli.targets.compact.settings import prompt_tokens
-from kerv_cli.targets.folders import find_target
 
 FORMATS = ("csv", "parquet", "db", "trace")
 _TRACED = ("rounds", "similarity", *(f"seconds.{phase}" for phase in READ_PHASES))  # columns of a trace

@@ -10,9 +10,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.paths import as_path
+from kerv_cli.base.paths import as_path, shipped_dir
 from kerv_cli.engine.cost import Profile, read_profile
-from kerv_cli.targets.folders import shipped_dir
 
 _SHIPPED = "-profile.json"
 _EIGHT_MS = 0.008  # what HeiSD's encoder takes on an A100 (arXiv 2603.17573)

@@ -1,18 +1,227 @@
-"""Write the sentences that say what a study shows. No other module of kerv writes such a sentence.
+"""Decide which setting of a study to take, and write the sentences that say what the study shows.
 
-A sentence says *faster*, *slower* or *loses less than* only if a 95 % interval shows it. If the baseline succeeds in
-less than the share `SOLVED` of its episodes, no setting is recommended.
+The setting is the fastest that is shown to lose little success. The settings of a finished study are tested in a fixed
+order, the safest first. The test ends at the first that fails (fixed-sequence testing). So all tests together have the
+error rate of one test (docs/methods.md §7).
+
+No other module of kerv writes such a sentence. It says *faster*, *slower* or *loses less than* only if a 95 % interval
+shows it. If the baseline succeeds in less than the share `SOLVED` of its episodes, no setting is recommended.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from operator import attrgetter
 
 from kerv_cli.base.durations import count
-from kerv_cli.report.decide import POINTS, SOLVED, Choice, choose
-from kerv_cli.report.results import Result, averaged, is_number
-from kerv_cli.report.statistics import MOST_PAIRS, Estimate
+from kerv_cli.report import statistics as stats
+from kerv_cli.report.measures import MARGIN
+from kerv_cli.report.results import Result, Row, averaged, columns_of, is_number
+
+SOLVED = 0.20
+"""Smallest success rate at which the baseline counts as solving its tasks."""
+POINTS = 100.0
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which setting to take, for one task or for all tasks together.
+
+    Attributes:
+        where: The task, or `all tasks`.
+        pairs: Number of pairs of the setting with the most pairs. A pair is one episode of the baseline and one of the
+            setting, from the same initial state.
+        baseline_success: Success rate of the baseline.
+        front: Settings that no other setting beats in both speed and success, the fastest first.
+        chosen: Fastest setting that is shown to lose less success than the bound. Empty if there is none.
+        loss_at_most: Upper bound on the chosen setting's loss of success, in points, at 95 % confidence. NaN if no
+            setting is chosen.
+        candidate: Fastest setting that more pairs would show to lose less than the bound, if the rates stay the same.
+            Empty if there is none, or if a setting is chosen.
+        candidate_pairs: About how many pairs in all the candidate needs. NaN without a candidate.
+        tested: Number of settings that are tested for their loss of success: those that are faster than the baseline or
+            were not timed.
+        episode_speedup: Speed per episode of the chosen setting, or else of the candidate, against the baseline. NaN if
+            it was not timed.
+        runs: Number of runs (commands) from which the interval of `episode_speedup` was computed.
+    """
+
+    where: str
+    pairs: int
+    baseline_success: float
+    front: tuple[str, ...] = ()
+    chosen: str = ""
+    loss_at_most: float = math.nan
+    candidate: str = ""
+    candidate_pairs: float = math.nan
+    tested: int = 0
+    episode_speedup: stats.Estimate = stats.NO_ESTIMATE
+    runs: int = 0
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether a setting is shown both to be faster and to lose less success than the bound."""
+        return bool(self.chosen) and self.episode_speedup.low > 1
+
+    @property
+    def is_unsolved(self) -> bool:
+        """Whether the baseline's success rate is too low for a recommendation."""
+        return self.baseline_success < SOLVED
+
+    def as_dict(self) -> Row:
+        """Return all fields by name, as JSON values. `front` becomes one text, joined by semicolons."""
+        return columns_of(vars(self)) | {"front": ";".join(self.front)}
+
+
+def choices(results: Iterable[Result], task_results: Iterable[Result], loss: float) -> list[Choice]:
+    """Return which setting to take for all tasks together, followed by which to take for each task.
+
+    Args:
+        results: The study's rows over all tasks.
+        task_results: The study's rows per task.
+        loss: Largest acceptable loss of success against the baseline, in points.
+    """
+    tasks: dict[str, list[Result]] = {}
+    for row in sorted(task_results, key=lambda row: row.task):
+        tasks.setdefault(row.task, []).append(row)
+    return [choose("all tasks", averaged(results), loss), *(choose(task, tasks[task], loss) for task in tasks)]
+
+
+def choose(where: str, rows: Sequence[Result], loss: float) -> Choice:
+    """Choose the fastest setting that is shown to lose less success than `loss`, for one task or for all tasks.
+
+    Args:
+        where: The task's name, or `all tasks`.
+        rows: Rows of the study's table for that task or for all tasks: one per setting, the baseline included.
+        loss: Largest acceptable loss of success against the baseline, in points.
+    """
+    success = next((row.measures.success.value for row in rows if row.is_baseline), math.nan)
+    pairs = max((row.measures.pairs for row in rows if not row.is_baseline), default=0)
+    undecided = Choice(where, pairs, success)
+    if undecided.is_unsolved:
+        return undecided
+    order = safest_first(rows)
+    undecided = replace(undecided, front=tuple(row.label for row in pareto(rows)), tested=len(order))
+    best = _fastest(passing(order, loss / POINTS))
+    if best is None:
+        return _with_candidate(undecided, order, loss)
+    loss_at_most, speed = -POINTS * best.measures.difference.low, best.measures.episode_speedup
+    return replace(undecided, chosen=best.label, loss_at_most=loss_at_most, episode_speedup=speed, runs=best.runs)
+
+
+def _with_candidate(undecided: Choice, order: Sequence[Result], loss: float) -> Choice:
+    """Add the fastest setting that more pairs would show to lose less than `loss` points, if there is one."""
+    needed, reached = 0.0, {}
+    for row in order:
+        # a setting is tested only after all safer ones have passed, so it needs the most pairs of all of these
+        needed = max(needed, stats.pairs_to_settle(row.measures.counts, loss / POINTS))
+        if math.isfinite(needed):
+            reached[row.label] = needed
+    candidate = _fastest([row for row in order if row.label in reached])
+    if candidate is None:
+        return undecided
+    return replace(
+        undecided,
+        candidate=candidate.label,
+        candidate_pairs=reached[candidate.label],
+        episode_speedup=candidate.measures.episode_speedup,
+        runs=candidate.runs,
+    )
+
+
+def safest_first(rows: Iterable[Result]) -> list[Result]:
+    """Return the rows of the settings to test, the safest first. Success does not influence the order.
+
+    Safe means: few unverified tokens, then many forwards per control step (`safety`). Settings that are equally safe
+    keep the study's order. The baseline, settings without pairs, and settings that were timed and were not faster are
+    left out.
+    """
+    return sorted((row for row in rows if row.is_compared and not row.speed <= 1), key=safety)
+
+
+def safety(row: Result) -> tuple[float, float]:
+    """Return the key that sorts settings from the safest on. It does not depend on success.
+
+    The setting with the smallest unverified share comes first: the share of executed actions that the target has not
+    verified, rounded to whole per cent. Settings that decode nothing come last. Of settings with equal shares, the one
+    with the most target forwards per control step comes first.
+    """
+    unverified = row.measures.unverified_share
+    return (1.0 if math.isnan(unverified) else round(unverified, 2), -row.measures.forwards_per_step)
+
+
+def passing(rows: Iterable[Result], loss: float) -> list[Result]:
+    """Test the settings in order. Return the rows before the first setting that is not shown to lose less than `loss`.
+
+    By fixed-sequence testing, all tests together have the error rate of one test.
+
+    Args:
+        rows: Rows of a table, in the order of the tests.
+        loss: Largest acceptable loss of success, as a share of episodes.
+    """
+    passed = []
+    for row in rows:
+        if not row.measures.difference.low > -loss:
+            break
+        passed.append(row)
+    return passed
+
+
+def _fastest(rows: Sequence[Result]) -> Result | None:
+    """Return the row of the fastest of the tested settings, or None if there are none.
+
+    A setting whose interval shows that it is faster than the baseline is preferred to any other. If no setting has a
+    measured speed, return the one that was tested last.
+    """
+
+    def speed(row: Result) -> tuple[bool, float]:
+        found = row.measures.episode_speedup
+        return (found.low > 1, found.value) if is_number(found.value) else (False, -math.inf)
+
+    return max(reversed(rows), key=speed, default=None)
+
+
+def pareto(rows: Iterable[Result]) -> list[Result]:
+    """Return the rows that no other row beats in both speed per episode and success, the fastest first.
+
+    The baseline has speed 1. Rows without a measured speed are left out.
+    """
+    point = attrgetter("speed", "measures.success.value")
+    timed = [row for row in rows if is_number(row.speed)]
+    front: list[Result] = []
+    for row in sorted(timed, key=point, reverse=True):
+        if not front or point(row)[1] > point(front[-1])[1] or point(row) == point(front[-1]):
+            front.append(row)
+    return front
+
+
+def with_matched_speed(rows: Sequence[Result]) -> list[Result]:
+    """Add the matched-success speed: one figure per method and baseline, in each of the method's rows.
+
+    How fast is a method at its fastest setting that keeps success (docs/methods.md §7)? The measure is from
+    WA-SpecDec, arXiv 2608.08725. It is the largest `episode_speedup` of the settings that pass the test with a margin
+    of 3 points. It is missing if no setting passes, or if the settings that pass were not timed. It is also missing for
+    the baseline itself, and if the baseline does not solve the tasks.
+
+    Args:
+        rows: One row per setting and task, or per setting and way of averaging.
+    """
+    solved = {(row.where, row.label) for row in rows if row.is_baseline and row.measures.success.value >= SOLVED}
+    groups: dict[tuple[str, str, str], list[Result]] = {}
+    for row in rows:
+        if (row.where, row.baseline) in solved and row.is_compared:
+            groups.setdefault((row.where, row.method, row.baseline), []).append(row)
+    fastest: dict[tuple[str, str, str], float] = {}
+    for key, group in groups.items():
+        speeds = [row.measures.episode_speedup.value for row in passing(sorted(group, key=safety), MARGIN)]
+        fastest[key] = max((speed for speed in speeds if speed > 0), default=math.nan)
+    matched = []
+    for row in rows:
+        speed = math.nan if row.is_baseline else fastest.get((row.where, row.method, row.baseline), math.nan)
+        matched.append(replace(row, matched_success_speed=speed))
+    return matched
 
 
 def verdict_of(results: Sequence[Result], loss: float) -> tuple[str, bool]:
@@ -78,7 +287,7 @@ def sentence(choice: Choice, loss: float, baseline: str) -> str:
     return f"{fastest}. {pairs} cannot show that it {bound}; {_missing(choice)}"
 
 
-def order_of(by_speed: Sequence[tuple[str, Estimate]]) -> str:
+def order_of(by_speed: Sequence[tuple[str, stats.Estimate]]) -> str:
     """Return the settings in the order of their speed per episode, and which neighbours cannot be told apart.
 
     Args:
@@ -104,7 +313,7 @@ def episodes_to_settle(results: Sequence[Result], loss: float) -> int:
     if len(baselines_of(rows)) > 1:
         return 0
     pairs = choose("all tasks", rows, loss).candidate_pairs
-    return math.ceil(pairs / rows[0].tasks) if pairs <= MOST_PAIRS else 0
+    return math.ceil(pairs / rows[0].tasks) if pairs <= stats.MOST_PAIRS else 0
 
 
 def unsolved(baseline: str, success: float) -> str:
@@ -155,7 +364,7 @@ def _missing(choice: Choice) -> str:
     if not choice.candidate:
         return "at these rates, more pairs would not show one either"
     more = max(1, math.ceil(choice.candidate_pairs - choice.pairs))
-    number = f"about {more}" if more <= MOST_PAIRS else f"more than {MOST_PAIRS:,}"
+    number = f"about {more}" if more <= stats.MOST_PAIRS else f"more than {stats.MOST_PAIRS:,}"
     return f"at these rates, {number} more pairs would show it for {choice.candidate}"
 
 

@@ -23,14 +23,13 @@ from torch import Tensor, nn
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import write_json
 from kerv_cli.base.manifests import read
-from kerv_cli.base.paths import artifact
+from kerv_cli.base.paths import artifact, find_target
 from kerv_cli.targets import checkpoint
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.compilable import compile_parts
 from kerv_cli.targets.compact.folder import build as build_compact
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import Layer, LayerStack, Rotary
-from kerv_cli.targets.folders import find_target
 from kerv_cli.targets.settings import BuildTargetSettings, GrowSettings
 
 STD = 0.02

@@ -44,8 +44,7 @@ from kerv_cli.methods.kerv.prediction import FILTERS, Noise, kalman_weights
 from kerv_cli.targets.observations import check_tail, observations_of
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_tasks, demos_for
-from kerv_cli.training.making import Begin, quietly
-from kerv_cli.training.settings import CalibrateSettings
+from kerv_cli.training.settings import Begin, CalibrateSettings, quietly
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.files import DemoEpisode

@@ -36,8 +36,7 @@ from kerv_cli.methods.heisd.datastore import (
 from kerv_cli.targets.observations import observations_of, observed_steps, prompts_of, read_chunks
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import demos_for
-from kerv_cli.training.making import Begin, quietly
-from kerv_cli.training.settings import BuildDatastoreSettings
+from kerv_cli.training.settings import Begin, BuildDatastoreSettings, quietly
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.files import DemoEpisode

@@ -20,13 +20,9 @@ from kerv_cli.methods.eagle.public import Convention, PublicDrafter, read_public
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_tasks, demos_for
-from kerv_cli.training.fit import Metrics, batches, fit, without_subnormals
-from kerv_cli.training.making import Begin, figures_of, identity_of, quietly, refuse_other, refuse_unused
-from kerv_cli.training.settings import BuildDrafterSettings, TrainDrafterSettings
+from kerv_cli.training.fit import Metrics, batches, figures_of, fit, identity_of, refuse_other, without_subnormals
+from kerv_cli.training.settings import Begin, BuildDrafterSettings, TrainDrafterSettings, quietly
 from kerv_cli.worlds import resolve_tasks
-
-OF_TARGETS = ("init", "balance", "closed_loop", "colour", "places")
-"""Optimisation settings that only the training of a target reads."""
 
 
 def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Begin = quietly) -> tuple[Path, Metrics]:
@@ -44,13 +40,12 @@ def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Beg
 
     Raises:
         UnknownName: The kind of drafter does not exist.
-        UsageError: A setting belongs to another kind of drafter, or only to the training of targets.
         CheckpointError: The target or the demonstrations do not exist or are damaged. Or the folder holds another
             training.
         KervError: The training diverged.
     """
-    drafter, train = drafter_of(settings), settings.train
-    artifacts = Artifacts(settings.results, settings.policy)
+    drafter: TrainableDrafter = find("drafter", settings.drafter.kind, "drafter.kind").built()
+    artifacts, train = Artifacts(settings.results, settings.policy), settings.train
     folder, description = artifacts.new(drafter.kind), artifacts.description
     description.check_autoregressive(
         f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
@@ -96,19 +91,6 @@ def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Beg
 
         with stage("training the drafter") as progress:
             return folder, fit(network, loss, validate, save, train, folder, identity, progress)
-
-
-def drafter_of(settings: TrainDrafterSettings) -> TrainableDrafter:
-    """Return the kind of drafter to train.
-
-    Raises:
-        UnknownName: The kind does not exist.
-        UsageError: A setting belongs to another kind of drafter, or only to the training of targets.
-    """
-    part = find("drafter", settings.drafter.kind, "drafter.kind")
-    refuse_unused(settings.train, OF_TARGETS, ": only the training of a target has this setting")
-    drafter: TrainableDrafter = part.built()
-    return drafter
 
 
 def import_drafter(settings: BuildDrafterSettings) -> tuple[Path, dict[str, Any]]:

@@ -17,6 +17,7 @@ import time
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -26,8 +27,11 @@ from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError, Interrupted, KervError
 from kerv_cli.base.files import write_bytes, write_if_changed
-from kerv_cli.targets.folders import RESUME
+from kerv_cli.base.paths import RESUME
+from kerv_cli.episodes.identity import hash_of
+from kerv_cli.methods.artifacts import removal
 from kerv_cli.training.settings import TrainSettings
+from kerv_cli.worlds.demos.dataset import DemoDataset
 
 Metrics = dict[str, float]
 Loss = Callable[[int], tuple[Tensor, Metrics]]
@@ -40,6 +44,12 @@ Progress = Callable[[int, int, str], None]
 """Takes the number of finished steps, the number of all steps, and the latest metrics as text."""
 
 _UNREADABLE = (OSError, EOFError, RuntimeError, KeyError, TypeError, ValueError, pickle.PickleError, zipfile.BadZipFile)
+NOT_IDENTITY = ("steps", "validate_every", "init", "stored")
+"""Optimisation settings that may change when a training resumes.
+
+`init` is among them because the hash of its weights counts instead of its name.
+"""
+
 SAME_REQUEST = 2.0
 """A second signal within this many seconds counts as the same request.
 
@@ -311,6 +321,37 @@ def until_interrupted() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
+def identity_of(train: TrainSettings, dataset: DemoDataset, **own: Any) -> str:
+    """Return a hash of the settings and data that determine the weights after a given number of steps.
+
+    Args:
+        train: Optimisation settings.
+        dataset: The demonstrations.
+        **own: Further values that determine the weights, such as the network's shapes.
+    """
+    counted = {key: value for key, value in asdict(train).items() if key not in NOT_IDENTITY}
+    counted["closed_loop"] = train.closed_loop > 0  # scores with and without success cannot be compared
+    return hash_of({"train": counted, "demos": dataset.sha256, **own})
+
+
+def refuse_other(folder: Path, identity: str, kind: str, setting: str) -> None:
+    """Refuse a folder that holds a training with other settings or data.
+
+    Args:
+        folder: The folder.
+        identity: Result of `identity_of`.
+        kind: Kind of the trained artifact, for the error message.
+        setting: The setting that names the folder, for the error message.
+
+    Raises:
+        CheckpointError: The folder holds another training.
+    """
+    if stored_identity(folder) not in (None, identity):
+        raise CheckpointError(
+            f"{folder} holds a run with other settings or data: choose another {setting}=, or {removal(kind, folder)}"
+        )
+
+
 def stored_identity(folder: Path) -> str | None:
     """Return the identity hash in the folder's resume file; None if there is no file that can be read."""
     try:
@@ -335,3 +376,12 @@ def read_state(path: Path) -> dict[str, Any]:
         reason = " ".join(str(error).split())
         raise CheckpointError(f"training state at {path} is damaged ({reason}): {remedy}") from error
     return state
+
+
+def figures_of(dataset: DemoDataset, network: Any, metrics: dict[str, float]) -> dict[str, Any]:
+    """Return facts about a training for the artifact's description: data, validation metrics, number of parameters."""
+    return {
+        "demos": {"sha256": dataset.sha256, "config": dataset.manifest.config},
+        "validation": metrics,
+        "parameters": sum(parameter.numel() for parameter in network.parameters()),
+    }

@@ -1,8 +1,11 @@
-"""Settings of the commands that record demonstrations, train, build or calibrate."""
+"""Settings of the commands that record demonstrations, train, build or calibrate, and how their work begins."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 from kerv_cli.base.errors import UsageError
@@ -17,6 +20,23 @@ DEMOS = "name of the demonstrations"
 TARGET_DEMOS = f"{DEMOS}; empty: the ones that the target was trained on"
 QUICK = "a first policy in minutes: adds the settings in conf/quick.yaml"
 FIRST_EPISODES = "episodes used per task, lowest seeds first; 0: all"
+
+
+Stage = Callable[[str], AbstractContextManager[Callable[..., None]]]
+"""Takes the title of a part of the work. Returns a context that yields a progress function (done, total)."""
+
+Begin = Callable[[str, Path, str, int], Stage]
+"""Called once all settings are checked, before the work begins.
+
+It takes the kind and the folder of the artifact, the line that `--plan` prints, and the number of optimisation steps or
+episodes (0: not known). A command passes a function that ends with the plan if `--plan` was typed. Otherwise the
+function notes in the database that the work began.
+"""
+
+
+def quietly(kind: str, folder: Path, plan: str, units: int) -> Stage:
+    """Begin an artifact without a row in the database, and show no progress. This is the default for `Begin`."""
+    return lambda title: nullcontext(lambda *done: None)
 
 
 @dataclass
@@ -112,6 +132,11 @@ class TrainDrafterSettings(DemonstrationSettings):
     drafter: Any = setting(chosen("drafter", "drafter"), "kind, with shapes and loss: drafter (EAGLE-2), early, scout")
     train: TrainSettings = setting(TrainSettings, "optimisation")
 
+    def check_together(self, prefix: str) -> None:
+        """Refuse optimisation settings that only the training of a target reads."""
+        unused = ("init", "balance", "closed_loop", "colour", "places")
+        refuse_unused(self.train, unused, ": only the training of a target has this setting")
+
 
 @dataclass
 class PrepareSettings(DemonstrationSettings):
@@ -205,3 +230,19 @@ class CalibrateSuccessSettings(SweepSettings):
     margin: float = number(5.0, above=0, most=99.9, help="points of success that may be lost against AR")
     delta: float = number(0.1, above=0, most=0.5, help="the certificate holds with probability 1 - delta")
     again: bool = setting(False, "test a policy once more, on other seeds, at half of delta for each earlier test")
+
+
+def refuse_unused(train: TrainSettings, keys: Sequence[str], why: str) -> None:
+    """Refuse optimisation settings that the training would ignore.
+
+    Args:
+        train: The optimisation settings.
+        keys: Names of the settings that this training does not read.
+        why: End of the error message, after `train.KEY=VALUE`.
+
+    Raises:
+        UsageError: One of the settings in `keys` differs from its default.
+    """
+    for key in keys:
+        if (value := getattr(train, key)) != getattr(TrainSettings(), key):
+            raise UsageError(f"train.{key}={value}{why}")

@@ -13,17 +13,16 @@ from torch import Tensor
 
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.paths import artifact
+from kerv_cli.base.paths import artifact, find_target
 from kerv_cli.base.runtime import set_up
 from kerv_cli.episodes.runner import success_of
 from kerv_cli.lab.database import Database
 from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.targets.folders import find_target
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_spaces, check_tasks, name_of, open_demos, seen_by
-from kerv_cli.training.fit import Metrics, batches, fit, without_subnormals
+from kerv_cli.training.fit import Metrics, batches, figures_of, fit, identity_of, refuse_other, without_subnormals
 from kerv_cli.training.imitation import (
     WAYPOINTS,
     Imitation,
@@ -33,8 +32,7 @@ from kerv_cli.training.imitation import (
     load_samples,
     vocabulary,
 )
-from kerv_cli.training.making import Begin, figures_of, identity_of, quietly, refuse_other, refuse_unused
-from kerv_cli.training.settings import TrainTargetSettings
+from kerv_cli.training.settings import Begin, TrainTargetSettings, quietly, refuse_unused
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
