@@ -93,7 +93,7 @@ class RunEntry:
     @property
     def tags(self) -> list[str]:
         """The words of its label `tag`."""
-        return [tag for tag in self.labels.get("tag", "").split(",") if tag]
+        return list(filter(None, self.labels.get("tag", "").split(",")))
 
     @property
     def command_line(self) -> str:
@@ -113,7 +113,7 @@ class RunEntry:
     @property
     def is_training(self) -> bool:
         """Whether the entry is a training, or has weights that were imported or copied."""
-        return not self.has_episodes and any((self.folder / name).is_file() for name in (LOG, WEIGHTS))
+        return not self.has_episodes and ((self.folder / LOG).is_file() or (self.folder / WEIGHTS).is_file())
 
 
 def few(names: Sequence[str], most: int = 3) -> str:
@@ -128,9 +128,14 @@ def find_runs(database: Database) -> list[RunEntry]:
     for parent in (*of_studies, *map(folder.joinpath, artifact_kinds())):
         with contextlib.suppress(OSError):
             clean(parent)  # what killed commands left there
-    found = {(one.kind, one.folder.name): one for one in (*_studies(database), *_artifacts(folder))}
-    finished = {(row.kind, row.name, row.command) for row in rows if row.status == COMPLETE}
-    newest = {(row.kind, row.name): row for row in reversed(rows)}
+    found: dict[tuple[str, str], RunEntry] = {}
+    for one in (*_studies(database), *_artifacts(folder)):
+        found[one.kind, one.folder.name] = one
+    finished, newest = set(), {}
+    for row in reversed(rows):
+        newest[row.kind, row.name] = row
+        if row.status == COMPLETE:
+            finished.add((row.kind, row.name, row.command))
     for (kind, name), row in newest.items():
         entry = found.get((kind, name))
         if entry is None:
@@ -181,12 +186,13 @@ def find_run(database: Database, name: str, exact: bool = False) -> RunEntry:
         raise UsageError(f"no runs in {database.results}: make one with 'kerv rollout method=spec_vla task=reach'")
     if name == LAST and not exact:
         return runs[0]
-    found = [run for run in runs if run.id == name] or [run for run in runs if name in run.id and not exact]
-    if not found:
-        raise UnknownName("run", name, [run.id for run in runs])
+    by_id = {run.id: run for run in runs}
+    found = [name] if name in by_id or exact else [one for one in by_id if name in one]
     if len(found) > 1:
-        raise UsageError(f"'{name}' is a part of {len(found)} runs: {', '.join(run.id for run in found[:5])}")
-    return found[0]
+        raise UsageError(f"'{name}' is a part of {len(found)} runs: {', '.join(found[:5])}")
+    if not found or found[0] not in by_id:
+        raise UnknownName("run", name, list(by_id))
+    return by_id[found[0]]
 
 
 def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry]:
@@ -224,7 +230,7 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
             and run.started >= since
         )
 
-    return [run for run in runs if agrees(run)]
+    return list(filter(agrees, runs))
 
 
 def store_of(run: RunEntry, database: Database) -> Study:
@@ -255,9 +261,9 @@ def _studies(database: Database) -> Iterator[RunEntry]:
         SETTINGS.c.position
     )
     with database.reading() as connection:
-        studies, tasks, settings = (connection.execute(query).all() for query in (sa.select(STUDIES), sums, of_setting))
+        studies, tasks = connection.execute(sa.select(STUDIES)).all(), connection.execute(sums).all()
+        settings = connection.execute(of_setting).all()
     for study in studies:
-        mine = [one for one in tasks if one.study_id == study.id]
         methods: dict[str, None] = {}
         made_from: dict[str, str] = {}
         for one in settings:
@@ -265,16 +271,20 @@ def _studies(database: Database) -> Iterator[RunEntry]:
                 methods[one.method] = None
                 _add_hashes(made_from, one.label, one.identity)
         total = successes = existing = 0
-        for one in mine:
-            total, existing, successes = total + one.all, existing + one.existing, successes + (one.successes or 0)
+        names, times = [], []
+        for one in tasks:
+            if one.study_id == study.id:
+                total, existing, successes = total + one.all, existing + one.existing, successes + (one.successes or 0)
+                names.append(one.task)
+                times.append(one.started)
         yield RunEntry(
             id=study.name,
             kind=study.kind,
             folder=Study(database, study.name, study.kind).root,
-            started=min((one.started for one in mine if one.started), default=study.created)[:23],
+            started=min(filter(None, times), default=study.created)[:23],
             state=COMPLETE if existing == total else f"{existing} of {total} episodes",
             methods=tuple(methods),
-            tasks=tuple(one.task for one in mine),
+            tasks=tuple(names),
             episodes=existing,
             total=total,
             done=existing,

@@ -52,7 +52,7 @@ def outcomes(store: Study, task: str = "", seed: int | None = None) -> list[Any]
         query = (
             sa.select(
                 SETTINGS.c.label, WANTED.c.task, WANTED.c.seed, WANTED.c.episode_id.label("episode"),
-                *(measures[name] for name in ("success", "closest_approach", "object_moved")),
+                measures["success"], measures["closest_approach"], measures["object_moved"],
                 WANTED.c.error.is_not(None).label("failed"),
             )
             .select_from(WANTED.join(SETTINGS).join(STUDIES).outerjoin(EPISODES, EPISODES.c.id == WANTED.c.episode_id))
@@ -109,7 +109,7 @@ def find_episode(database: Database, number: int) -> FoundEpisode:
         UsageError: There is no such episode, or no study uses it any more, because it was run again.
     """
     with database.reading() as connection:
-        own = [EPISODES.c[name] for name in ("task", "seed", "repeat", "order", "block", "started")]
+        own = EPISODES.c["task", "seed", "repeat", "order", "block", "started"]
         about = STUDIES.c.name.label("study"), STUDIES.c.kind, BLOCKS.c.about
         query = (
             sa.select(SETTINGS, *about, *own, *measures_in(connection))

@@ -16,13 +16,14 @@ import re
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
-from kerv_cli.base.files import atomic_path, visible
+from kerv_cli.base.files import atomic_path
 from kerv_cli.catalogue.imports import connect_foreign
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.episodes.identity import ENGINE, OBSERVATION, flat
@@ -125,8 +126,8 @@ def import_evaluations(
         StorageError: The disk is full or not writable.
         CheckpointError: A file is damaged.
     """
-    by_label = labelled([read_evaluations(path) for path in paths], labels)
-    benchmarks = list(dict.fromkeys(one.benchmark for one in itertools.chain(*by_label.values())))
+    by_label = labelled(list(map(read_evaluations, paths)), labels)
+    benchmarks = list(dict.fromkeys(map(attrgetter("benchmark"), itertools.chain(*by_label.values()))))
     name = name or re.sub(r"\W+", "_", "-".join(benchmarks))[:80].strip("_") or "imported"
     stored = Study(database, name)
     if stored.exists and stored.kind != IMPORT:
@@ -158,28 +159,29 @@ def read_evaluations(path: Path) -> list[Evaluation]:
         UsageError: There is no recording, no recording has an episode, or they are of several servers.
         CheckpointError: A file is damaged or incomplete.
     """
-    files = [file for file in visible(path) if file.suffix == ".sqlite"] if path.is_dir() else [path]
+    files = sorted(path.glob("[!.]*.sqlite")) if path.is_dir() else [path]
     if not files:
         raise UsageError(f"{path} holds no recording of vla-eval (recording-….sqlite)")
     evaluations: list[Evaluation] = []
     for file in files:
         try:
-            evaluations += [one for one in _read_recording(file) if one.episodes]
+            evaluations += filter(attrgetter("episodes"), _read_recording(file))
         except _DAMAGE as error:
             why = " ".join(f"{type(error).__name__} {error}".split())[:120]
             raise CheckpointError(f"{file} is damaged, cut short or no recording of vla-eval ({why})") from error
     if not evaluations:
         raise UsageError(f"{path}: the recording holds no episode")
-    benchmarks = {one.benchmark for one in evaluations}
+    benchmarks = set(map(attrgetter("benchmark"), evaluations))
     if len(benchmarks) < len(evaluations) or any(one.server != evaluations[0].server for one in evaluations):
         raise UsageError(f"{path} holds several evaluations of a benchmark, or of several servers: name each file")
     return evaluations
 
 
-def _read_recording(path: Path) -> list[Evaluation]:
+def _read_recording(path: Path) -> Iterator[Evaluation]:
     """Read the evaluations in a vla-eval recording."""
     with contextlib.closing(connect_foreign(path)) as file:
-        return [_evaluation(file, path, *row) for row in file.execute("SELECT eval_id, metadata FROM eval_metadata")]
+        for name, metadata in file.execute("SELECT eval_id, metadata FROM eval_metadata"):
+            yield _evaluation(file, path, name, metadata)
 
 
 def _evaluation(file: sqlite3.Connection, path: Path, name: str, metadata: str) -> Evaluation:
@@ -195,7 +197,7 @@ def _evaluation(file: sqlite3.Connection, path: Path, name: str, metadata: str) 
     episodes = []
     for task, index, metrics, steps, seconds, eid, reason in rows:
         measured, index = dict(json.loads(metrics or "{}")), int(index)
-        start = tuple(float(x) for x in measured.get("initial_state") or (index,))
+        start = tuple(map(float, measured.get("initial_state") or (index,)))
         task, seed = " ".join(str(task or "unknown").split())[:200], int(measured.get("seed", index))
         result = bool(measured.get("success")), int(steps or 0), float(seconds or 0.0)
         episodes.append(RecordedEpisode(task, index, seed, *result, str(eid or ""), start, str(reason or "")))
@@ -221,9 +223,13 @@ def labelled(recordings: Sequence[list[Evaluation]], labels: Sequence[str] = ())
             f"labels={','.join(labels)}: write a different one for each of the {len(recordings)} recordings"
         )
     by_label: dict[str, list[Evaluation]] = {}
-    for name, evaluations in zip(labels or [one[0].name for one in recordings], recordings, strict=True):
-        names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
-        by_label[next(one for one in names if one not in by_label)] = evaluations
+    for position, evaluations in enumerate(recordings):
+        label = name = labels[position] if labels else evaluations[0].name
+        number = 1
+        while label in by_label:
+            number += 1
+            label = f"{name}-{number}"
+        by_label[label] = evaluations
     first, *others = by_label
     for other in others:
         _check_same_episodes(f"{first} and {other}", by_label[first], by_label[other])
@@ -231,21 +237,20 @@ def labelled(recordings: Sequence[list[Evaluation]], labels: Sequence[str] = ())
 
 
 def _check_same_episodes(names: str, first: Sequence[Evaluation], other: Sequence[Evaluation]) -> None:
-    ours, theirs = {one.benchmark: one for one in first}, {one.benchmark: one for one in other}
-    shared = [benchmark for benchmark in ours if benchmark in theirs]
+    name_of, world_of = attrgetter("benchmark"), attrgetter("task", "seed")
+    shared = [(a, b) for a, b in itertools.product(first, other) if a.benchmark == b.benchmark]
     if not shared:
-        raise UsageError(f"{names} have different benchmarks: {', '.join(ours)} and {', '.join(theirs)}")
+        ours, theirs = ", ".join(map(name_of, first)), ", ".join(map(name_of, other))
+        raise UsageError(f"{names} have different benchmarks: {ours} and {theirs}")
     has_pairs = False
-    for benchmark in shared:
-        a, b = ours[benchmark], theirs[benchmark]
+    for a, b in shared:
         left, right = _conditions(a.config), _conditions(b.config)
         for key in sorted(left.keys() | right.keys()):
             if left.get(key) != right.get(key):
                 raise UsageError(
-                    f"{names} have different episodes of {benchmark}: {key} is {left.get(key)} and {right.get(key)}"
+                    f"{names} have different episodes of {a.benchmark}: {key} is {left.get(key)} and {right.get(key)}"
                 )
-        worlds = {(one.task, one.seed) for one in a.episodes}
-        has_pairs |= any((one.task, one.seed) in worlds for one in b.episodes)
+        has_pairs |= not set(map(world_of, a.episodes)).isdisjoint(map(world_of, b.episodes))
     if not has_pairs:
         raise UsageError(f"{names} have no episode in common: neither task nor seed agree")
 
@@ -268,17 +273,19 @@ def _episodes(
         names_benchmark: Whether to put the benchmark's name before the task's.
     """
     each = int(one.config.get("episodes_per_task") or 0)
-    for task in dict.fromkeys(episode.task for episode in one.episodes):
-        episodes = [episode for episode in one.episodes if episode.task == task]
-        good = {e.seed: e for e in sorted(episodes, key=lambda e: e.seed) if not e.reason}
+    by_task: dict[str, list[RecordedEpisode]] = {}
+    for episode in one.episodes:
+        by_task.setdefault(episode.task, []).append(episode)
+    for task, episodes in by_task.items():
+        good = {e.seed: e for e in sorted(episodes, key=attrgetter("seed")) if not e.reason}
         offset = episodes[0].seed - episodes[0].index if not episodes[0].reason else 0
         name = f"{one.benchmark}: {task}" if names_benchmark else task
-        for seed in dict.fromkeys([*good, *(i + offset for i in range(each))]):
+        for seed in dict.fromkeys([*good, *range(offset, offset + each)]):
             yield Episode(setting, name, seed), good.get(seed)
 
 
 def _notes(label: str, one: Evaluation) -> Iterator[str]:
-    reasons = [episode.reason for episode in one.episodes if episode.reason]
+    reasons = list(filter(None, map(attrgetter("reason"), one.episodes)))
     if reasons:
         why = ", ".join(sorted(set(reasons)))
         yield f"{label}: {len(reasons)} episodes ended in an error ({why}) and are left out"

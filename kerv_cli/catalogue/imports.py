@@ -7,6 +7,7 @@ import dataclasses
 import sqlite3
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from kerv_cli.worlds.demos.files import foreign_table
 _DAMAGE = (sa.exc.SQLAlchemyError, sqlite3.Error, pa.ArrowException, OSError, ValueError, KeyError, TypeError,
            AttributeError)  # fmt: skip
 _FURTHER = ("order", "started")
-_ROW = (*(column.name for column in MEASURES), *_FURTHER)
+_ROW = (*map(attrgetter("name"), MEASURES), *_FURTHER)
 
 MOST_STEPS = 20_000_000
 """Limit on steps of SQLite's virtual machine per connection, about a second. It grows by STEPS_PER_BYTE per byte."""
@@ -154,9 +155,11 @@ def _in_database(path: Path, database: Database, name: str, stack: contextlib.Ex
         version = int(connection.scalar(sa.select(about.value).where(about.key == "schema_version")) or 0)
         if version > SCHEMA:
             raise newer(path, version)
-        rows = connection.execute(sa.select(tables.STUDIES)).all()
-        found = [_stored(connection, row, database, name) for row in rows]
-    return [dataclasses.replace(one, episodes=_checked(path, one.episodes)) for one in found]
+        found = []
+        for row in connection.execute(sa.select(tables.STUDIES)).all():
+            study = _stored(connection, row, database, name)
+            found.append(dataclasses.replace(study, episodes=_checked(path, study.episodes)))
+    return found
 
 
 def _stored(connection: sa.Connection, row: Any, database: Database, name: str = "") -> Found:
@@ -181,8 +184,8 @@ def _stored_episodes(connection: sa.Connection, settings: dict[int, Setting]) ->
     """
     blocks, decodes = tables.BLOCKS.c, tables.DECODES
     of_block = blocks.id.label("block"), blocks.about, blocks.run, blocks.seeds, blocks.code
-    stored = [*measures_in(connection), *(tables.EPISODES.c[name] for name in _FURTHER)]
-    measures = (column.label(f"row.{name}") for name, column in zip(_ROW, stored, strict=True))
+    stored = [*measures_in(connection), *tables.EPISODES.c[_FURTHER]]
+    measures = [column.label(f"row.{name}") for name, column in zip(_ROW, stored, strict=True)]
     query = (
         sa.select(tables.WANTED, *measures, *of_block, decodes.c.parquet)
         .select_from(tables.WANTED.join(tables.EPISODES).join(tables.BLOCKS))
@@ -194,7 +197,7 @@ def _stored_episodes(connection: sa.Connection, settings: dict[int, Setting]) ->
         episode = Episode(settings[row["setting_id"]], row["task"], row["seed"], row["repeat"])
         values = {name: row[f"row.{name}"] for name in _ROW}
         table = foreign_table(row["parquet"]).cast(DECODE_SCHEMA)
-        yield ImportedEpisode(episode, values, table, **{column.name: row[column.name] for column in of_block})
+        yield ImportedEpisode(episode, values, table, row["block"], row["about"], row["run"], row["seeds"], row["code"])
 
 
 def _checked(path: Path, episodes: Iterator[ImportedEpisode]) -> Iterator[ImportedEpisode]:

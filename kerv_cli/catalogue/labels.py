@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from operator import itemgetter
 
 import sqlalchemy as sa
 
@@ -23,7 +24,7 @@ def labels_in(database: Database) -> dict[str, dict[str, str]]:
 
 def set_labels(database: Database, run: str, labels: Mapping[str, str]) -> None:
     """Replace the labels of a run, given its id. Empty labels are removed."""
-    kept = {name: text for name, text in labels.items() if text}
+    kept = dict(filter(itemgetter(1), labels.items()))
     with database.writing() as connection:
         connection.execute(sa.delete(ABOUT).where(ABOUT.c.key == _KEY + run))
         if kept:

@@ -103,8 +103,7 @@ def _version(chosen: bool) -> None:
     if chosen:
         from kerv_cli.targets.provenance import git_commit, versions
 
-        names = ", ".join(f"{name} {number}" for name, number in versions().items())
-        typer.echo(f"{names}, commit {git_commit()}")
+        typer.echo(f"{', '.join(map(' '.join, versions().items()))}, commit {git_commit()}")
         raise typer.Exit(0)
 
 

@@ -59,7 +59,7 @@ def export(settings: CommandSettings, names: list[str], as_json: AsJson = False)
     """Write the board as files: tables, plots, films, tokens. They open without a server and can be sent."""
     from kerv_cli.base.files import write_folder
     from kerv_cli.board.export import export_board
-    from kerv_cli.catalogue.entries import find_run
+    from kerv_cli.catalogue.entries import disk_bytes, find_run
     from kerv_cli.lab.database import opened
 
     if not names:
@@ -69,7 +69,7 @@ def export(settings: CommandSettings, names: list[str], as_json: AsJson = False)
         raise UsageError(f"{folder} holds other files: name another folder")
     runs = [find_run(database, name).id for name in names[1:]]
     write_folder(folder, lambda new: files.extend(export_board(database, runs, new)))
-    size = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    size = disk_bytes(folder)
     if as_json:
         end_with_json({"folder": folder, "files": len(files), "bytes": size})
     typer.echo(f"{count(len(files), 'file')}, {size / 1e6:.1f} MB: open {folder / 'index.html'}")

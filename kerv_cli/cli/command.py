@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields
@@ -76,8 +77,12 @@ def schemas_of(part: Command) -> list[type]:
 
     The first one is the command's own. The second one belongs to the command that `each` names, if there is one.
     """
-    others = [commands(part.each)[part.each]] if part.each else []
-    return [one.settings for one in (part, *others)]
+    return [part.settings, commands(part.each)[part.each].settings] if part.each else [part.settings]
+
+
+def fields_of(settings: Any) -> dict[str, Field[Any]]:
+    """Return the fields of a settings dataclass by name."""
+    return {at.name: at for at in fields(settings)}
 
 
 def top_keys(part: Command) -> list[str]:
@@ -85,10 +90,11 @@ def top_keys(part: Command) -> list[str]:
     if part.settings is NoSettings:
         return []
     schemas = schemas_of(part)
-    groups = [group for schema in schemas for group in choices_of(schema)]
-    names = [at.name for schema in schemas for at in fields(schema)]
-    hidden = {key for key in part.typed.values() if "." not in key}
-    return [key for key in dict.fromkeys([*part.typed, *groups, *names]) if key not in hidden]
+    groups, names = map(choices_of, schemas), map(fields_of, schemas)
+    keys = dict.fromkeys(itertools.chain(part.typed, *groups, *names))
+    for hidden in part.typed.values():
+        keys.pop(hidden, None)
+    return list(keys)
 
 
 def commands(words: str = "") -> dict[str, Command]:
@@ -102,7 +108,7 @@ def commands(words: str = "") -> dict[str, Command]:
     files, first = MODULES["command"], words.partition(" ")[0]
     file = f"kerv_cli.cli.{'importing' if first == 'import' else first}"
     found = parts("command", file if file in files else "")
-    places = {file: place for place, file in enumerate(files)}
+    places = dict(zip(files, range(len(files)), strict=True))
     names = sorted(found, key=lambda name: places.get(found[name].module, len(files)))  # plugins last
     return {name: cast(Command, found[name]) for name in names if f"{name} ".startswith(f"{words} ".lstrip())}
 
@@ -135,8 +141,13 @@ def _flags(command: TyperCommand, options: Mapping[str, object]) -> list[str]:
         options: The values of the options, by the name of the parameter.
     """
     names = {param.name: param.opts[0] for param in command.params}
-    given = [(names[name], value) for name, value in options.items() if value not in (None, False)]
-    return [word for name, value in given for word in ([name] if value is True else [name, str(value)])]
+    words: list[str] = []
+    for name, value in options.items():
+        if value is True:
+            words.append(names[name])
+        elif value not in (None, False):
+            words += names[name], str(value)
+    return words
 
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 120}
@@ -154,13 +165,15 @@ def complete(part: Command, typed: Sequence[str], incomplete: str) -> list[str]:
         typed: The words before the one to complete.
         incomplete: The beginning of the word to complete.
     """
-    keys, before = top_keys(part), [word for word in typed if word != "="]
-    if before and before[-1] in keys:
-        return [name for name in _values(part, before[-1]) if name.startswith(incomplete)]
-    key, equals, value = incomplete.partition("=")
-    if not equals:
-        return [f"{name}=" for name in keys if name.startswith(incomplete)]
-    return [f"{key}={name}" for name in _values(part, key) if name.startswith(value)]
+    words, before = top_keys(part), list(filter("=".__ne__, typed))
+    key, equals, _ = incomplete.partition("=")
+    if before and before[-1] in words:
+        words = _values(part, before[-1])
+    elif equals:
+        words = [f"{key}={name}" for name in _values(part, key)]
+    else:
+        words = [f"{word}=" for word in words]
+    return [word for word in words if word.startswith(incomplete)]
 
 
 def _values(part: Command, key: str) -> list[str]:
@@ -172,9 +185,8 @@ def _values(part: Command, key: str) -> list[str]:
     for schema in schemas_of(part):
         if key in choices_of(schema):
             return groups()[key]
-        for at in fields(schema):
-            if at.name == key:
-                return list(at.metadata.get("names", ()))
+        if key in fields_of(schema):
+            return list(fields_of(schema)[key].metadata.get("names", ()))
     return []
 
 
@@ -192,13 +204,16 @@ def _split(part: Command, typed: list[str], named: bool) -> tuple[list[str], lis
     if not named:
         return typed, []
     keys = set(top_keys(part))
-    overrides = [one for one in typed if "=" in one and one.lstrip("+").partition("=")[0].split(".")[0] in keys]
-    names = [one for one in typed if one not in overrides]
     filters = set(re.findall(r"(\w+)=", part.names))
-    for name in names:
-        key, equals, _ = name.partition("=")
-        if equals and re.fullmatch(r"[\w.]+", key) and key not in filters and not Path(name).exists():
+    overrides, names = [], []
+    for word in typed:
+        key, equals, _ = word.partition("=")
+        if equals and key.lstrip("+").split(".")[0] in keys:
+            overrides.append(word)
+        elif equals and re.fullmatch(r"[\w.]+", key) and key not in filters and not Path(word).exists():
             raise UnknownName("key", key, sorted(keys | filters))
+        else:
+            names.append(word)
     return overrides, names
 
 
@@ -277,13 +292,14 @@ class CommandWithSettings(FastFlags, TyperCommand):
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
         """Add the most used settings, the subcommands and the examples to the help."""
         keys = [_row(self.part, key) for key in self.part.shown]
-        below = [part for name, part in commands(self.part.name).items() if name != self.part.name]
+        below = commands(self.part.name)
+        below.pop(self.part.name, None)
         if keys:
             with formatter.section(f"Settings, with their defaults (all of them: kerv {self.part.name} --cfg)"):
                 formatter.write_dl(keys)
         if below:
             with formatter.section("Commands"):
-                formatter.write_dl([(part.name, summary_of(part)) for part in below])
+                formatter.write_dl([(name, summary_of(part)) for name, part in below.items()])
         if self.part.examples:
             with formatter.section("Examples"):
                 for line in self.part.examples:
@@ -306,10 +322,10 @@ def _row(part: Command, key: str) -> tuple[str, str]:
         `key=default`, and the type with the description.
     """
     name = part.typed.get(key, key)
-    schema = next(schema for schema in schemas_of(part) if name.split(".")[0] in {at.name for at in fields(schema)})
+    schema = next(schema for schema in schemas_of(part) if name.split(".")[0] in fields_of(schema))
     value: Any = _defaults(schema)
     for word in name.split("."):
-        at = next(at for at in fields(value) if at.name == word)
+        at = fields_of(value)[word]
         value = getattr(value, word)
     choices = choices_of(schema)
     shown = "" if value is None else "{…}" if isinstance(value, dict) else plain_text(value)

@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -264,9 +265,9 @@ def progress_bar(title: str, record: Run | None = None, has_estimate: bool = Fal
 
     timed = [bars.BarColumn(), bars.MofNCompleteColumn(), bars.TimeElapsedColumn()]
     timed += [] if has_estimate else [bars.TimeRemainingColumn()]
-    name, text = (bars.TextColumn(f"{{task.{one}}}", markup=False) for one in ("description", "fields[text]"))
+    name, extra = map(partial(bars.TextColumn, markup=False), ("{task.description}", "{task.fields[text]}"))
     shown: Any = {"console": console(stderr=True), "transient": True, "disable": not on_terminal}
-    with bars.Progress(name, *timed, text, **shown) as bar:
+    with bars.Progress(name, *timed, extra, **shown) as bar:
         task = bar.add_task(title, total=None, text="")
         yield advance
 
@@ -284,23 +285,26 @@ def print_table(columns: Iterable[str], rows: Iterable[Iterable[object]], title:
 
     Args:
         columns: Names of the columns.
-        rows: Cells of each row.
+        rows: Cells of each row. None is shown as a dash.
         title: A line above the table. It is never wrapped, because it may contain a path to copy.
     """
     from rich.table import Table
 
     table = Table(*columns)
     for row in rows:
-        table.add_row(*map(str, row))
+        table.add_row(*map(_cell, row))
     if title:
         typer.echo(title)
     console().print(table, markup=False)  # cells may name an extra in brackets
 
 
+def _cell(value: object) -> str:
+    return "–" if value is None else str(value)
+
+
 def print_rows(rows: Sequence[Mapping[str, object]], title: str | None = None) -> None:
-    """Print a table of rows with the same keys, which are the columns. None is shown as a dash."""
-    cells = (("–" if value is None else value for value in row.values()) for row in rows)
-    print_table(rows[0], cells, title)
+    """Print a table of rows with the same keys, which are the columns."""
+    print_table(rows[0], (row.values() for row in rows), title)
 
 
 def print_figures(what: str, figures: Mapping[str, float], folder: object, as_json: bool = False) -> None:
@@ -314,6 +318,8 @@ def print_figures(what: str, figures: Mapping[str, float], folder: object, as_js
     """
     if as_json:
         end_with_json({"folder": folder, **figures})
-    rows = ((name, f"{value:.4g}" if isinstance(value, float) else value) for name, value in figures.items())
+    rows = []
+    for name, value in figures.items():
+        rows.append((name, f"{value:.4g}" if isinstance(value, float) else value))
     print_table((what, ""), rows)
     typer.echo(str(folder))

@@ -37,7 +37,7 @@ def compare(names: list[str], as_json: AsJson = False) -> None:
     (a, first_of), (b, second_of) = map(_counts, words)
     first, second, p = wilson(a, first_of), wilson(b, second_of), None
     if given:
-        lost, won = (int(given.get(name, 0)) for name in ("lost", "won"))
+        lost, won = int(given.get("lost", 0)), int(given.get("won", 0))
         is_whole = all(number.denominator == 1 for number in given.values())
         if not is_whole or first_of != second_of or a - lost + won != b or not 0 <= lost <= a:
             raise UsageError(
@@ -103,8 +103,14 @@ def power(names: list[str], as_json: AsJson = False) -> None:
 
 def _options(names: list[str]) -> tuple[list[str], Mapping[str, Fraction]]:
     """Split the arguments into counts or rates, and the numbers given as `key=number`."""
-    pairs = [word.partition("=") for word in names if "=" in word]
-    return [word for word in names if "=" not in word], {key: _number(value, f"{key}=") for key, _, value in pairs}
+    words, numbers = [], {}
+    for word in names:
+        key, equals, value = word.partition("=")
+        if equals:
+            numbers[key] = _number(value, f"{key}=")
+        else:
+            words.append(word)
+    return words, numbers
 
 
 def _number(text: str, key: str = "") -> Fraction:

@@ -6,6 +6,7 @@ import shutil
 import time
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 import typer
@@ -63,11 +64,13 @@ def doctor(settings: DoctorSettings, as_json: AsJson = False) -> None:
         findings += check_environment(specs()[settings.environment], settings.seed)
     if not settings.policy.target and not settings.environment:
         findings = check_machine(settings)
-    failed = not all(finding.ok for finding in findings)
+    rows, failed = [], False
+    for one in findings:
+        rows.append((one.what, "ok" if one.ok else "FAILS", one.says))
+        failed |= not one.ok
     if as_json:
-        end_with_json([asdict(finding) for finding in findings], code=int(failed))
-    states = {True: "ok", False: "FAILS"}
-    print_table(("check", "", "finding"), ((one.what, states[one.ok], one.says) for one in findings))
+        end_with_json(list(map(asdict, findings)), code=int(failed))
+    print_table(("check", "", "finding"), rows)
     raise typer.Exit(int(failed))
 
 
@@ -77,13 +80,15 @@ def check_machine(settings: DoctorSettings) -> list[Finding]:
     from kerv_cli.targets.provenance import versions
     from kerv_cli.worlds import specs
 
-    packages = ", ".join(f"{name} {number}" for name, number in versions().items())
     display = "a display is there: kerv view opens a window" if has_display() else "none: kerv view prints the command"
-    findings = [Finding("versions", True, packages)]
-    findings += [find(f"rendering {spec.name}", partial(_rendering, spec, settings)) for spec in specs().values()]
+    findings = [Finding("versions", True, ", ".join(map(" ".join, versions().items())))]
+    for spec in specs().values():
+        check = partial(_rendering, spec, settings)
+        findings.append(find(f"rendering {spec.name}", check))
     findings.append(find("torch", partial(_torch, settings)))
-    shipped = [path.name for path in visible(shipped_dir()) if path.is_dir()]
-    findings += [find(f"policy {name}", partial(_policy, name, settings)) for name in shipped]
+    for folder in filter(Path.is_dir, visible(shipped_dir())):
+        check = partial(_policy, folder.name, settings)
+        findings.append(find(f"policy {folder.name}", check))
     findings.append(find("results", partial(_disk, settings)))
     findings.append(find("database", partial(_database, settings)))
     findings.append(Finding("display", True, display))

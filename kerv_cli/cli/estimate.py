@@ -51,7 +51,7 @@ def estimate(settings: EstimateSettings, as_json: AsJson = False) -> None:
         found.setdefault(title, []).append(Estimate(costs, tokens))
     rows = []
     for title, estimates in found.items():
-        row: dict[str, Any] = {"machine": title, "tokens": tokens, "engines": [document(one) for one in estimates]}
+        row: dict[str, Any] = {"machine": title, "tokens": tokens, "engines": list(map(document, estimates))}
         row["notes"] = notes(policy, estimates)
         if settings.hz:
             row["rate"] = rate(estimates, settings.hz, settings.actions)

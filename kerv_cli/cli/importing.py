@@ -41,8 +41,8 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
 
     if not names:
         raise UsageError("name what to import: kerv runs import old-results, or kerv runs import recording-ID.sqlite")
-    paths = [as_path(name) for name in names]
-    files = [file for file in map(database_in, paths) if file]
+    paths = list(map(as_path, names))
+    files = list(filter(None, map(database_in, paths)))
     database = opened(settings.results)
     if files:
         if len(files) < len(paths):

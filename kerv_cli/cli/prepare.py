@@ -35,8 +35,10 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
 
     database, name = opened(settings.results), settings.policy.target
     steps = planned(settings, database)
-    lines = {step.kind: line_of(step.command, overrides) for step in steps}
-    rows = [(step.kind, step.state, f"kerv {shlex.join(lines[step.kind])}") for step in steps]
+    lines, rows = {}, []
+    for step in steps:
+        lines[step.kind] = line_of(step.command, overrides)
+        rows.append((step.kind, step.state, f"kerv {shlex.join(lines[step.kind])}"))
     print_table(("what", "state", "command"), rows, name)
     if plan:
         for step in steps:

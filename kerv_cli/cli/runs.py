@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 from dataclasses import asdict
+from itertools import starmap
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -79,7 +81,7 @@ def list_(settings: CommandSettings, names: list[str], as_json: AsJson = False) 
     filters = dict(word.partition("=")[::2] for word in names)
     runs = matching(find_runs(opened(settings.results)), filters)
     if as_json:
-        end_with_json([_entry_row(run) for run in runs])
+        end_with_json(list(map(_entry_row, runs)))
     if not runs:
         typer.echo(f"no runs in {settings.results}" + (" that agree" if names else ""))
         return
@@ -108,7 +110,7 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
     chosen = compared_runs(database, name)
     run = chosen[0].run
     data = load_study(store_of(run, database)) if run.has_episodes and run.episodes else None
-    labels = [side.label for side in chosen]
+    labels = set(map(attrgetter("label"), chosen))
     size, origin = disk_bytes(run.folder), parents(run, find_runs(database))
     if as_json:
         content = {**_entry_row(run), "made_from": origin, "bytes": size}
@@ -117,7 +119,7 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
     line = run.command_line or "unknown"
     lines = {"run": run.id, "kind": run.kind, "state": run.state, "started": run.started, "folder": run.folder}
     lines |= run.labels
-    parts = {"made from": ", ".join(f"{kind} {name}" for kind, name in origin.items())} if origin else {}
+    parts = {"made from": ", ".join(map(" ".join, origin.items()))} if origin else {}
     words = "command" if run.has_episodes else "made by"
     for name, value in (lines | {"size": f"{size / 1e6:.1f} MB", words: line} | parts).items():
         typer.echo(f"{name:<9} {value}")
@@ -194,7 +196,7 @@ def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False
     from kerv_cli.report import compare as comparing
 
     runs = _run_names(names, 2, 2, "two runs, ID or ID:SETTING")
-    comparisons = [comparing.compare(a, b) for a, b in comparing.pairs_to_compare(opened(settings.results), *runs)]
+    comparisons = list(starmap(comparing.compare, comparing.pairs_to_compare(opened(settings.results), *runs)))
     if as_json:
         end_with_json(comparisons)
     for comparison in comparisons:
@@ -203,7 +205,7 @@ def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False
             print_rows(comparison["settings"])
         else:
             typer.echo("no difference in settings, weights, machine or versions")
-        print_rows([_result_cells(row) for row in comparison["results"]])
+        print_rows(list(map(_result_cells, comparison["results"])))
         if comparison["note"]:
             typer.echo(comparison["note"])
 
@@ -256,11 +258,12 @@ def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     from kerv_cli.lab.database import opened
 
     database = opened(settings.results)
-    runs = [find_run(database, name, exact=yes) for name in _run_names(names, 1, 1000)]
-    for run in runs:
-        check_removable(run)
-    total = sum(disk_bytes(run.folder) for run in runs)
-    what = f"{', '.join(run.id for run in runs)} ({total / 1e6:.1f} MB)"
+    runs, total = [], 0
+    for name in _run_names(names, 1, 1000):
+        runs.append(find_run(database, name, exact=yes))
+        check_removable(runs[-1])
+        total += disk_bytes(runs[-1].folder)
+    what = f"{', '.join(map(attrgetter('id'), runs))} ({total / 1e6:.1f} MB)"
     try:
         sure = yes or typer.confirm(f"remove {what}?", err=True)
     except typer.Abort:  # Ctrl-C, or nobody to ask

@@ -46,8 +46,10 @@ def _place(results: str, name: str) -> Path:
 
     database = opened(results)
     if name == LAST:
-        folders = (run.folder for run in find_runs(database) if run.has_episodes)
-        return next((folder for folder in folders if any(recordings_below(folder))), Path(results))
+        for run in find_runs(database):
+            if run.has_episodes and any(recordings_below(run.folder)):
+                return run.folder
+        return Path(results)
     try:
         return find_run(database, name).folder
     except UnknownName:
