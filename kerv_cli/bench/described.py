@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -195,7 +196,7 @@ def _of_target(target: Mapping[str, Any], folder: Path) -> Described:
     actions, size = target["actions"], int(own["image_size"]) if own.get("observation") != "state" else 0
     tokens = int(own["chunk"]) * len(actions["names"])
     views = len(target["cameras"]) if size else 0
-    width, wide, layers, heads = (int(trunk[key]) for key in ("width", "feed_forward", "layers", "heads"))
+    width, wide, layers, heads = map(int, itemgetter("width", "feed_forward", "layers", "heads")(trunk))
     language = Language(int(actions["bins"]), width, wide, layers, heads)
     stored = (folder / "model.safetensors").stat().st_size / 2 if (folder / "model.safetensors").is_file() else 0
     small = own["layers"] * (4 * own["width"] ** 2 + 3 * own["width"] * own["feed_forward"])

@@ -148,8 +148,10 @@ def decoders(model: Model) -> list[Decoder]:
         draft = Dummy(in_prefill) if in_prefill else None
         return Decoder(target, Parts(rule, everything, draft, proposer))
 
-    equal = [rows - 1 for rows in range(2, size) if size % rows == 0]  # drafts of which all rounds commit as many
-    every = [decoder(), *(decoder(nodes, Dummy(nodes)) for nodes in equal)]
+    every = [decoder()]
+    for rows in range(2, size):
+        if size % rows == 0:  # all rounds commit equally many tokens
+            every.append(decoder(rows - 1, Dummy(rows - 1)))
     every += [decoder(0, Dummy(size - 2)), decoder(size - 1), decoder(max(_MERGED, size - 1))]
     for shape in ((size - 2, 1, size - 2), (min(3, size - 2), 1, 3), _TREE):
         every.append(decoder(0, DrafterProposer(model.drafter, target, *shape)))
@@ -339,7 +341,7 @@ class Bench:
             "threads": torch.get_num_threads(),
             **stamp(str(device)),
             "card": card_of(self.model, self.machine),
-            "phases": [phase.as_dict() for phase in self.phases],
+            "phases": list(map(Phase.as_dict, self.phases)),
             "profile": self.profile.as_dict(),
         }
 

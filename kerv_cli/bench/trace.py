@@ -15,6 +15,7 @@ from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.limits import number
 from kerv_cli.engine.cost import COUNTED, READ_PHASES, Work, work_of
 from kerv_cli.engine.record import PARALLEL
+from kerv_cli.report.results import values_of
 
 MOST = 1_000_000  # of every count in a trace
 MODES = ("forward", "skip", PARALLEL)
@@ -159,7 +160,8 @@ def work_of_trace(decodes: Sequence[TracedDecode], tokens: int) -> Work:
             phases[name][number_] = decode.seconds.get(name, 0.0)
         phases["vision"][number_] = decode.encoded
     columns = {name: np.array(list(map(itemgetter(name), rounds))) for name in COUNTED}
-    counts, searched = np.array([len(one.rounds) for one in decodes]), np.array([one.searched for one in decodes])
+    counts = np.array(list(map(len, values_of(decodes, "rounds"))))
+    searched = np.array(values_of(decodes, "searched"))
     return work_of(columns, counts, phases, searched, tokens)
 
 

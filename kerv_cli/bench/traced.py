@@ -8,12 +8,14 @@ from operator import itemgetter
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.bench.expected import Decodes, Drafts
 from kerv_cli.bench.trace import TracedDecode, grouped, work_of_trace
 from kerv_cli.engine.cost import prices
 from kerv_cli.report.profiles import NamedProfile
+from kerv_cli.report.results import values_of
 
 _RESAMPLES = 200
 _SEED = 0
@@ -56,8 +58,7 @@ def _ratio(one: np.ndarray, other: np.ndarray, chosen: np.ndarray) -> list[float
 
 def _numbers(decodes: Sequence[TracedDecode]) -> np.ndarray:
     """Return the number of each decode's episode, from 0, (decodes,)."""
-    numbers: dict[str, int] = {}
-    return np.array([numbers.setdefault(one.episode, len(numbers)) for one in decodes])
+    return pd.factorize(np.array(values_of(decodes, "episode")))[0]
 
 
 def _resampled(

@@ -30,6 +30,7 @@ from kerv_cli.board.recorder import Recorder
 from kerv_cli.catalogue.episodes import FoundEpisode, find_episode, outcomes
 from kerv_cli.engine.record import PHASES, DecodeRecord
 from kerv_cli.lab.store import IMPORT
+from kerv_cli.report.results import values_of
 from kerv_cli.report.viewing.film import Film, animation, film_of
 from kerv_cli.report.viewing.token_outcomes import OUTCOMES, chunk_size, outcomes_of, tokens_hash
 from kerv_cli.report.viewing.viewer import viewer_command
@@ -51,8 +52,10 @@ def _film(request: Request) -> Film:
 def _names(task: str, decodes: Sequence[DecodeRecord]) -> Sequence[str]:
     """Return the names of the D degrees of freedom of a task, or their numbers if its environment is not known here."""
     dofs = max((decode.actions.shape[1] for decode in decodes if decode.actions.ndim == 2), default=1)
-    names = next((spec.actions.names for spec in specs().values() if task in spec.tasks), ())
-    return names if len(names) == dofs else [str(number) for number in range(dofs)]
+    for spec in specs().values():
+        if task in spec.tasks and len(spec.actions.names) == dofs:
+            return spec.actions.names
+    return list(map(str, range(dofs)))
 
 
 def command_of(found: FoundEpisode) -> tuple[str, str]:
@@ -81,7 +84,7 @@ def show_episode(request: Request) -> Response:
     names = _names(episode.task, decodes)
     size = chunk_size(decodes, len(names))
     chunks = [outcomes_of(decode, size, len(names)) for decode in decodes]
-    counts = Counter(one.kind for one in itertools.chain.from_iterable(chunks))
+    counts = Counter(values_of(itertools.chain.from_iterable(chunks), "kind"))
     command, why_not = command_of(found)
     text = request.query_params.get("decode", "")
     chosen = int(text) if re.fullmatch(r"\d{1,6}", text) and int(text) < len(decodes) else 0

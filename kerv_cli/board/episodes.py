@@ -19,6 +19,7 @@ from kerv_cli.episodes.identity import stress_of
 from kerv_cli.lab.plan import Setting
 from kerv_cli.lab.store import Study
 from kerv_cli.report.measures import NEAR
+from kerv_cli.report.results import distinct, values_of
 from kerv_cli.report.tables import references_of
 
 SUCCESS, FAILURE, LOST, WON, ERROR, MISSING = "success", "failure", "lost", "won", "error", "missing"
@@ -148,11 +149,12 @@ def grids_of(cells: Sequence[Cell]) -> list[Grid]:
         tasks[cell.task].append(cell)
     grids = []
     for task, some in tasks.items():
-        failed = Counter(cell.seed for cell in some if cell.kind in FAILURES)
+        failed: Counter[int] = Counter()
         rows: dict[str, dict[int, Cell]] = defaultdict(dict)
         for cell in some:
             rows[cell.label][cell.seed] = cell
-        seeds = sorted({cell.seed for cell in some}, key=lambda seed: (-failed[seed], seed))
+            failed[cell.seed] += cell.kind in FAILURES
+        seeds = sorted(failed, key=lambda seed: (-failed[seed], seed))
         grids.append(Grid(task, seeds, rows, failed.total(), len(some)))
     return sorted(grids, key=lambda grid: -grid.failed)
 
@@ -164,12 +166,12 @@ def clusters_of(cells: Sequence[Cell]) -> list[tuple[list[Cell], int]]:
         Each group, with the number of episodes of its task and setting that have run.
     """
     groups: dict[tuple[str, ...], list[Cell]] = defaultdict(list)
+    ran: Counter[tuple[str, str]] = Counter()
     for cell in cells:
         if cell.kind in FAILURES:
             groups[cell.task, cell.label, cell.phase].append(cell)
-    ran = Counter((cell.task, cell.label) for cell in cells if cell.episode is not None)
-    clusters = ((some, ran[some[0].task, some[0].label]) for some in groups.values())
-    return sorted(clusters, key=lambda cluster: -len(cluster[0]))
+        ran[cell.task, cell.label] += cell.episode is not None
+    return [(some, ran[some[0].task, some[0].label]) for some in sorted(groups.values(), key=len, reverse=True)]
 
 
 def _asked(request: Request) -> tuple[list[Cell], dict[str, Any]]:
@@ -185,7 +187,7 @@ def _asked(request: Request) -> tuple[list[Cell], dict[str, Any]]:
     store = Study(database_of(request), request.path_params["name"])
     baseline, settings = settings_in(store)
     cells = cells_of(outcomes(store), baseline, settings)
-    known = {"setting": list(settings), "task": sorted({cell.task for cell in cells})}
+    known = {"setting": list(settings), "task": sorted(distinct(cells, "task"))}
     chosen = {name: request.query_params.get(name, "") for name in known}
     for name, value in chosen.items():
         if value and value not in known[name]:
@@ -197,7 +199,7 @@ def _asked(request: Request) -> tuple[list[Cell], dict[str, Any]]:
 def show_episodes(request: Request) -> Response:
     """Show all episodes of a study as a grid."""
     cells, asked = _asked(request)
-    counts = Counter(cell.kind for cell in cells)
+    counts = Counter(values_of(cells, "kind"))
     return render(request, "episodes.html", grids=grids_of(cells), counts=counts, outcomes=OUTCOMES, **asked)
 
 

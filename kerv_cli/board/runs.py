@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from itertools import starmap
 from urllib.parse import urlencode
 
 from starlette.requests import Request
@@ -14,6 +15,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.board.pages import database_of, refreshed, render
 from kerv_cli.catalogue.entries import RunEntry, find_runs
 from kerv_cli.report.compare import compare, pairs_to_compare
+from kerv_cli.report.results import values_of
 
 STATES: dict[str, Callable[[RunEntry], bool]] = {
     "running": lambda run: run.is_running,
@@ -38,7 +40,7 @@ def show_runs(request: Request, version: str, is_live: bool) -> Response:
     asked = {name: request.query_params.get(name, "") for name in ("kind", "state", "text", "sort")}
     only = request.app.state.only
     every = [run for run in find_runs(database_of(request)) if not only or run.id in only]
-    kinds = Counter(run.kind for run in every)
+    kinds = Counter(values_of(every, "kind"))
     runs = [run for run in every if _agrees(run, asked)]
     order = asked["sort"].removeprefix("-")
     if order in ORDERS:
@@ -77,7 +79,7 @@ def show_comparison(request: Request) -> Response:
     if len(names) != 2:
         raise UsageError("choose two runs to compare")
     pairs = pairs_to_compare(database_of(request), *names)
-    return render(request, "compare.html", names=names, comparisons=[compare(a, b) for a, b in pairs])
+    return render(request, "compare.html", names=names, comparisons=list(starmap(compare, pairs)))
 
 
 ROUTES = [Route("/", show_runs), Route("/compare", show_comparison)]

@@ -18,6 +18,7 @@ from kerv_cli.catalogue.entries import find_runs, parents
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import RUNNING, run_rows
 from kerv_cli.lab.store import Study
+from kerv_cli.report.results import values_of
 
 _SHARE = 0.01
 """Largest share of each core's time for refreshing the page of a running study, so that its times are not disturbed."""
@@ -60,7 +61,7 @@ def show_study(request: Request, version: str, is_live: bool) -> Response:
         run=run,
         title=run.id,
         parents=parents(run, runs),
-        known={one.id for one in runs},
+        known=set(values_of(runs, "id")),
         version=version,
         is_live=is_live and run.is_running,
     )
@@ -73,7 +74,7 @@ def show_tables(request: Request) -> Response:
     """Show the report of a study: its verdict, tables and charts."""
     database, name = database_of(request), request.path_params["name"]
     store = Study(database, name)
-    is_running = any(row.status == RUNNING for row in run_rows(database, store.kind, name))
+    is_running = RUNNING in values_of(run_rows(database, store.kind, name), "status")
     version = f"{store.version()}/{is_running}"
     if request.query_params.get("known") == version:
         return Response(status_code=204)

@@ -34,6 +34,7 @@ from kerv_cli.methods.certified.certificate import Attempt, Candidate, Certifica
 from kerv_cli.methods.compose import Method
 from kerv_cli.report.betting import p_value
 from kerv_cli.report.measures import paired
+from kerv_cli.report.results import values_of
 from kerv_cli.report.tables import load_study
 from kerv_cli.targets.provenance import provenance
 from kerv_cli.training.settings import CalibrateSuccessSettings
@@ -117,7 +118,8 @@ def planned_certificate(
     tested = _candidates(resolved)
     first = next(iter(tested.values()))
     artifacts, tasks = artifacts_of(first), resolve_tasks(first.task)
-    hashes = artifacts.check(itertools.chain.from_iterable(Method.of(one).needs for one in tested.values()))
+    needs = values_of(map(Method.of, tested.values()), "needs")
+    hashes = artifacts.check(itertools.chain.from_iterable(needs))
     candidates = []
     for label, one in tested.items():
         skip, draft = dataclasses.asdict(one.skip), dataclasses.asdict(one.prefill_draft)
@@ -134,7 +136,7 @@ def planned_certificate(
         dtype=first.runtime.dtype,
         margin=settings.margin,
         delta=settings.delta,
-        seeds=seeds_text(one.seed for one in wanted),
+        seeds=seeds_text(values_of(wanted, "seed")),
         candidates=candidates,
         chosen=None,
         provenance={"command": "kerv calibrate success", "engine": ENGINE, **provenance(first.runtime.device)},
@@ -173,11 +175,11 @@ def charged(
     if earlier and not again:
         raise UsageError(
             f"this policy has had {count(len(earlier), 'test')}, on seeds "
-            f"{', '.join(one.seeds for one in earlier)}: another one is another chance to certify falsely. Set "
+            f"{', '.join(values_of(earlier, 'seeds'))}: another one is another chance to certify falsely. Set "
             f"again=true to test on other seeds at delta={certificate.delta / 2 ** len(earlier):g}"
         )
     for attempt in earlier:
-        if attempt.seeds_served & {one.seed for one in episodes}:
+        if not attempt.seeds_served.isdisjoint(values_of(episodes, "seed")):
             raise UsageError(f"seeds {attempt.seeds} served an earlier test of this policy: set seed= to others")
     if study := _other_study(certificate.target, store, episodes):
         raise UsageError(f"study '{study}' ran this policy on some of these seeds: set seed= to others")
@@ -204,8 +206,7 @@ def attempts_on(target: str, folders: Iterable[Path]) -> list[Attempt]:
 
 def _other_study(target: str, store: Study, episodes: Sequence[Episode]) -> str:
     """Return the name of another study in which the policy ran some of these episodes. Empty if there is none."""
-    wanted = {(one.task, one.seed) for one in episodes}
-    seeds = {seed for _, seed in wanted}
+    wanted, seeds = set(map(attrgetter("task", "seed"), episodes)), values_of(episodes, "seed")
     query = (
         sa.select(STUDIES.c.name, SETTINGS.c.identity, WANTED.c.task, WANTED.c.seed)
         .select_from(WANTED.join(SETTINGS).join(STUDIES))
@@ -233,7 +234,7 @@ def certify(certificate: Certificate, store: Study, wanted: Sequence[Episode], b
     """
     episodes = load_study(store, wanted).episodes
     episodes = episodes[episodes["repeat"] == 0]  # a repeat measures the same world again: it is no further pair
-    pairs = paired(episodes, {one.label: baseline for one in certificate.candidates})
+    pairs = paired(episodes, dict.fromkeys(values_of(certificate.candidates, "label"), baseline))
     testing = bool(episodes.loc[episodes["label"] == baseline, "success"].mean() >= SOLVED_BY_AR)
     candidates: list[Candidate] = []
     chosen = None
@@ -255,7 +256,7 @@ def _candidate(planned: Candidate, pairs: pd.DataFrame, margin: float, delta: fl
         delta: Level of the test.
         testing: Whether to compute a p-value. False after an earlier setting has failed, or if AR solves too little.
     """
-    ar, own = (pairs[f"success_{side}"].to_numpy(float) for side in ("baseline", "method"))
+    ar, own = pairs["success_baseline"].to_numpy(float), pairs["success_method"].to_numpy(float)
     # (n,) values in a random order, independent of the tasks
     seed = int.from_bytes(hashlib.sha256(str(len(ar)).encode()).digest()[:4], "big")
     values, bound = np.random.default_rng(seed).permutation((1 + ar - own) / 2), (1 + margin / POINTS) / 2

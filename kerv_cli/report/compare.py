@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import pandas as pd
@@ -13,7 +14,7 @@ from kerv_cli.lab.database import Database
 from kerv_cli.lab.plan import seeds_text
 from kerv_cli.lab.store import Study
 from kerv_cli.report.measures import measure, paired
-from kerv_cli.report.results import Row, is_number
+from kerv_cli.report.results import Row, distinct, is_number, values_of
 from kerv_cli.report.statistics import Estimate
 from kerv_cli.report.summary import DIFFERENCE, SPEEDS
 from kerv_cli.report.tables import StudyData, differences, flatten, load_study, split_values
@@ -97,12 +98,13 @@ def pairs_to_compare(database: Database, first: str, second: str) -> list[tuple[
     ours, theirs = compared_runs(database, first), compared_runs(database, second)
     if ours[0].run.has_episodes != theirs[0].run.has_episodes:
         raise UsageError(f"{ours[0].run.id} and {theirs[0].run.id} cannot be compared: only one of them has episodes")
-    others = {side.label: side for side in theirs}
-    pairs = [(side, others[side.label]) for side in ours if side.label in others]
+    pairs = [(a, b) for a, b in itertools.product(ours, theirs) if a.label == b.label]
     if len(pairs) < 2 and not (pairs and len(ours) == len(theirs) == 1):
         pairs = [(ours[0], side) for side in theirs if side != ours[0]]
-    runs = {side.run.id: side.run for side in (ours[0], theirs[0]) if side.run.has_episodes}
-    data = {name: load_study(store_of(run, database)) for name, run in runs.items()}
+    data: dict[str, StudyData] = {}
+    for run in (ours[0].run, theirs[0].run):
+        if run.has_episodes and run.id not in data:
+            data[run.id] = load_study(store_of(run, database))
     return [(replace(a, data=data.get(a.run.id)), replace(b, data=data.get(b.run.id))) for a, b in pairs]
 
 
@@ -144,8 +146,8 @@ def _settings_of(side: ComparedRun) -> Row:
     settings = flatten(without(setting.settings, NOT_DETERMINING - {"policy", "method"}))
     for name, value in without(setting.identity, {OBSERVATION}).items():
         settings[name] = value[:12]
-    settings["tasks"] = ";".join(sorted({one.task for one in wanted}))
-    settings["seeds"] = seeds_text(one.seed for one in wanted)
+    settings["tasks"] = ";".join(sorted(distinct(wanted, "task")))
+    settings["seeds"] = seeds_text(values_of(wanted, "seed"))
     for name in _PROVENANCE:
         if name in episodes:
             settings[name] = ";".join(sorted(split_values(episodes[name].dropna())))

@@ -76,13 +76,13 @@ def _to_parquet(store: Study, folder: Path, labels: Mapping[str, str]) -> list[P
         labelled = frame.assign(**labels).drop(columns=["episode", "decode_seconds"])
         table = pa.Table.from_pandas(labelled, preserve_index=False)
         pq.write_table(table, path, compression="zstd")
-    schema = pa.schema([*(table.schema.field(key) for key in keys), *DECODE_SCHEMA])
+    schema = pa.schema([*map(table.schema.field, keys), *DECODE_SCHEMA])
     with atomic_path(decodes) as path, pq.ParquetWriter(path, schema, compression="zstd") as writer:
         for start in range(0, len(frame), _AT_ONCE):
             part = frame.iloc[start : start + _AT_ONCE]
             rows = store.decodes(list(part["episode"]))
             episode_keys = pa.Table.from_pandas(part[keys], preserve_index=False).take(rows["episode"])
-            columns = [*episode_keys.columns, *(rows[name] for name in DECODE_SCHEMA.names)]
+            columns = [*episode_keys.columns, *rows.select(DECODE_SCHEMA.names).columns]
             writer.write_table(pa.table(columns, names=schema.names).cast(schema))
     return [episodes, decodes]
 

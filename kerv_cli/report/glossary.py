@@ -60,8 +60,11 @@ def explanations(settings: Iterable[tuple[str, str]]) -> dict[str, str]:
     Returns:
         A dictionary from label or heading to explanation. Settings whose names have no known word are left out.
     """
-    found = {label: explained(label, method) for label, method in settings}
-    return {name: text for name, text in found.items() if text} | {"tokens unverified": UNVERIFIED}
+    found = {}
+    for label, method in settings:
+        if text := explained(label, method):
+            found[label] = text
+    return found | {"tokens unverified": UNVERIFIED}
 
 
 def with_code(text: str) -> Markup:

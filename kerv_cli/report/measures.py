@@ -65,8 +65,9 @@ def measure(
     found: dict[Any, Any] = means.to_dict("index")
     for group, others in found.items():
         part = counts.loc[group, :]  # a row per difficulty group
-        rates = [stats.wilson(*row) for row in part[["successes", "worlds"]].to_numpy().tolist()]
-        changes = [stats.paired_difference(stats.PairedCounts(*row)) for row in part[outcomes].to_numpy().tolist()]
+        rates = list(itertools.starmap(stats.wilson, part[["successes", "worlds"]].to_numpy().tolist()))
+        pairings = itertools.starmap(stats.PairedCounts, part[outcomes].to_numpy().tolist())
+        changes = list(map(stats.paired_difference, pairings))
         sums = part.sum().to_dict()
         pooled = stats.PairedCounts(*map(sums.__getitem__, outcomes))
         measured[group] = Measures(
@@ -137,7 +138,7 @@ def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame
     for name in COMPARABLE:
         agree &= elsewhere | (both[f"{name}_method"] == both[f"{name}_baseline"])
     both = both[agree].sort_values(keys, kind="stable").reset_index(drop=True)
-    won, reference = (both[f"success_{side}"].astype(bool) for side in ("method", "baseline"))
+    won, reference = both["success_method"].astype(bool), both["success_baseline"].astype(bool)
     outcomes = {"both": won & reference, "only_baseline": ~won & reference, "only_method": won & ~reference}
     outcomes["neither"] = ~won & ~reference
     return both.assign(
@@ -212,9 +213,12 @@ def _means(episodes: pd.DataFrame, by: list[str]) -> pd.DataFrame:
         "near_contact_failure": (distances < NEAR).astype(float).where(~solved & distances.notna()),
     }
     quantiles = {"latency_p50_ms": 0.5, "latency_p95_ms": 0.95, "latency_worst_ms": 1.0}
-    decodes = (1000.0 * np.concatenate(list(arrays)) for _, arrays in groups["decode_seconds"])
-    latencies = np.transpose([np.quantile(one, list(quantiles.values())) for one in decodes])
-    means = episodes[by].assign(**each).groupby(by).mean().assign(**dict(zip(quantiles, latencies, strict=True)))
+    latencies = []
+    for _, arrays in groups["decode_seconds"]:
+        milliseconds = 1000.0 * np.concatenate(list(arrays))
+        latencies.append(np.quantile(milliseconds, list(quantiles.values())))
+    means = episodes[by].assign(**each).groupby(by).mean()
+    means[list(quantiles)] = latencies
     sums = groups[list(dict.fromkeys(itertools.chain.from_iterable(_RATIOS.values())))].sum()
     for name, (above, below) in _RATIOS.items():
         means[name] = sums[above] / sums[below].mask(sums[below] == 0)

@@ -21,7 +21,7 @@ from PIL import Image
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import write_if_changed
-from kerv_cli.report.results import Result, averaged, frame_of, is_number
+from kerv_cli.report.results import Result, averaged, distinct, frame_of, is_number, values_of
 from kerv_cli.report.summary import MAIN, summary_frame
 from kerv_cli.report.tables import NO_STRESS, is_stressed, latency_table
 from kerv_cli.report.tally import Tally
@@ -61,22 +61,22 @@ def study_figures(results: Sequence[Result], axis: str, loss: float = 3.0) -> di
     """
     rows = _drawn(results)
     if is_stressed(results):
-        kinds = [kind for kind in rows["stress"].unique() if kind != NO_STRESS]
+        kinds = rows.loc[rows["stress"] != NO_STRESS, "stress"].unique()
         points = pd.concat(rows[rows["stress"].isin([NO_STRESS, kind])].assign(panel=kind) for kind in kinds)
         points = points.assign(line=points["unstressed"], x=points["stress_level"])
         return {"": lines_figure([_points(points, SUCCESS)], "level of stress", "success, %")}
     rows = with_lines(rows, axis)
     if rows["x"].notna().any():
         measures = [_points(rows.assign(panel=TITLES[name]), name) for name in (SPEED, SUCCESS)]
-        return {"": lines_figure([one for one in measures if len(one)], axis)}
+        return {"": lines_figure(filter(len, measures), axis)}
     return {"_tradeoff": _tradeoff(rows, loss)} if rows["pairs"].any() else {}
 
 
 def about(results: Sequence[Result]) -> str:
     """Return the subtitle of a chart: policies, number of settings, tasks and episodes, device, number format."""
-    labels = {row.label for row in results}
+    labels = distinct(results, "label")
     targets = list(dict.fromkeys(str(row.settings["policy.target"]) for row in results))
-    tasks, episodes = max(row.tasks for row in results), max(row.episodes for row in results)
+    tasks, episodes = max(values_of(results, "tasks")), max(values_of(results, "episodes"))
     names = ", ".join(targets) if len(targets) <= 2 else f"{len(targets)} policies"
     counts = f"{count(len(labels), 'setting')} on {count(tasks, 'task')}, {count(episodes, 'episode')} each"
     return f"{names} · {counts} · {results[0].provenance['device_name']}, {results[0].settings['runtime.dtype']}"
@@ -108,14 +108,14 @@ def _points(rows: pd.DataFrame, column: str) -> pd.DataFrame:
     scale = 1.0 if column == SPEED else 100.0
     ends = {"value": "", "low": "_low", "high": "_high"}
     values = {name: scale * rows[f"{column}{end}"].astype(float) for name, end in ends.items()}
-    texts = [name for name in rows if str(name).startswith("text ")]
+    texts = rows.filter(regex="^text ").columns
     fields = rows.reindex(columns=["setting", "line", "x", "panel", "is_baseline", *texts])
     return fields.assign(**values).dropna(subset="value")
 
 
 def _tooltip(points: pd.DataFrame) -> list[alt.Tooltip]:
-    names = [str(name) for name in points if str(name).startswith("text ")]
-    return [alt.Tooltip(f"{name}:N", title=name.removeprefix("text ")) for name in names]
+    texts = points.filter(regex="^text ").columns
+    return [alt.Tooltip(f"{name}:N", title=name.removeprefix("text ")) for name in texts]
 
 
 def _faded(full: float) -> alt.When:
@@ -183,7 +183,7 @@ def lines_figure(measures: Iterable[pd.DataFrame], xlabel: str, ylabel: str | No
     scale, charts = alt.Scale(zero=False, padding=12), []
     for title, part in points.groupby("panel", sort=False):
         base = alt.Chart(part).encode(color=colour, tooltip=_tooltip(part))
-        y, low = (alt.Y(f"{name}:Q", scale=scale, title=ylabel) for name in ("value", "low"))
+        y, low = alt.Y("value:Q", scale=scale, title=ylabel), alt.Y("low:Q", scale=scale, title=ylabel)
         drawn, alone = base.transform_filter("isValid(datum.x)"), base.transform_filter("!isValid(datum.x)")
         drawn = drawn.encode(x=alt.X("x:Q", scale=scale, title=xlabel))
         layers = [

@@ -20,7 +20,7 @@ from kerv_cli.engine.cost import COUNTED, READ_PHASES, Profile, Work, prices, re
 from kerv_cli.episodes.identity import batch_of
 from kerv_cli.report.measures import measure, paired
 from kerv_cli.report.profiles import ENCODERS, NamedProfile, open_profiles
-from kerv_cli.report.results import Measures, Result, Row, averaged, columns_of
+from kerv_cli.report.results import Measures, Result, Row, averaged, columns_of, values_of
 from kerv_cli.report.summary import interval
 from kerv_cli.report.tables import StudyData
 
@@ -63,7 +63,7 @@ class Priced:
 
 def prices_table(priced: Iterable[Priced]) -> pd.DataFrame:
     """Return the estimated speeds as a data frame: one row per machine and setting."""
-    return pd.DataFrame(row.columns for row in priced)
+    return pd.DataFrame(values_of(priced, "columns"))
 
 
 def repriced(data: StudyData, profiles: Sequence[NamedProfile]) -> list[Priced]:

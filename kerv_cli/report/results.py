@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from numbers import Real
+from operator import attrgetter
 from typing import Any
 
 import pandas as pd
@@ -152,7 +153,7 @@ class Result:
         stress: Kind of stress, or `none`.
         stress_level: Level of stress.
         provenance: Machine, versions and the like, by column.
-        matched_success_speed: See `decide.with_matched_speed`.
+        matched_success_speed: See `verdict.with_matched_speed`.
     """
 
     study: str
@@ -226,7 +227,17 @@ def columns_of(values: Mapping[str, Any]) -> Row:
 
 def frame_of(results: Iterable[Result]) -> pd.DataFrame:
     """Return rows as a data frame. A missing value is NaN."""
-    return pd.DataFrame(columns_of(vars(row)) for row in results)
+    return pd.DataFrame(map(columns_of, map(vars, results)))
+
+
+def values_of(rows: Iterable[Any], name: str) -> list[Any]:
+    """Return an attribute of each row, such as `label` or `measures.counts`."""
+    return list(map(attrgetter(name), rows))
+
+
+def distinct(rows: Iterable[Any], name: str) -> list[Any]:
+    """Return the different values of an attribute, in the order of the rows."""
+    return list(dict.fromkeys(map(attrgetter(name), rows)))
 
 
 def averaged(results: Iterable[Result], averaging: str = MICRO) -> list[Result]:

@@ -84,8 +84,9 @@ def mean_of(groups: Sequence[Estimate]) -> Estimate:
     if not known:
         return NO_ESTIMATE
     values, lows, highs = np.array(known).T
-    below, above = (math.sqrt(((bounds - values) ** 2).sum()) / len(known) for bounds in (lows, highs))
     mean = float(values.mean())
+    below = math.sqrt(((lows - values) ** 2).sum()) / len(known)
+    above = math.sqrt(((highs - values) ** 2).sum()) / len(known)
     return Estimate(mean, mean - below, mean + above)
 
 
@@ -105,7 +106,7 @@ def paired_difference(counts: PairedCounts) -> Estimate:
     if not pairs:
         return NO_ESTIMATE
     both, only_baseline, only_method, neither = counts
-    method, baseline = (wilson(both + won, pairs) for won in (only_method, only_baseline))
+    method, baseline = wilson(both + only_method, pairs), wilson(both + only_baseline, pairs)
     surplus = float(both * neither - only_method * only_baseline)
     if surplus > 0:
         surplus = max(surplus - pairs / 2, 0.0)  # correction for continuity

@@ -17,7 +17,7 @@ from rich.text import Text
 from kerv_cli.base.durations import count
 from kerv_cli.engine.record import PHASES
 from kerv_cli.episodes.identity import batch_of, stress_text
-from kerv_cli.report.results import MICRO, Result, averaged, is_number
+from kerv_cli.report.results import MICRO, Result, averaged, distinct, is_number, values_of
 from kerv_cli.report.statistics import Estimate
 from kerv_cli.report.tables import StudyData
 
@@ -145,7 +145,7 @@ class SummaryTable:
         """Yield the title, the table and the notes below it."""
         rows = averaged(self.results)
         first = rows[0]
-        tasks, episodes = max(row.tasks for row in rows), max(row.episodes for row in rows)
+        tasks, episodes = max(values_of(rows, "tasks")), max(values_of(rows, "episodes"))
         counts = f"{count(tasks, 'task')}, {count(episodes, 'episode')} per setting"
         device = f"{first.provenance['device_name']}, {first.settings['runtime.dtype']}"
         yield Text(f"{first.study}: {counts}, {device}", "bold", overflow="fold")
@@ -156,7 +156,7 @@ class SummaryTable:
             yield _printed(part)
         if self.how and len(shown.columns) < len(frame.columns):
             yield Text(f"{len(shown.columns)} of {len(frame.columns)} columns; {self.how} shows all")
-        several = ", under the same stress and clock" if len({row.baseline for row in rows}) > 1 else ""
+        several = ", under the same stress and clock" if len(distinct(rows, "baseline")) > 1 else ""
         yield Text(f"{NOTE} {of_runs(rows)} Baseline: {first.baseline}{several}.")
         if frame[SPEEDS["episode_speedup"]].str.endswith(APART).any():
             yield Text(f"{APART} only from pairs that were measured in turn")
@@ -166,7 +166,7 @@ class SummaryTable:
 
 def of_runs(results: Sequence[Result]) -> str:
     """Return one sentence that says from how many runs the intervals of speed were computed."""
-    runs = min(row.runs for row in results)
+    runs = min(values_of(results, "runs"))
     return f"Intervals of speed: of {runs} runs." if runs > 2 else "Intervals of speed: of this run alone."
 
 
@@ -178,7 +178,7 @@ def _printed(frame: pd.DataFrame) -> Table:
             _heading(name), justify="left" if is_label else "right", overflow="fold", no_wrap=not is_label
         )
     for row in frame.itertuples(index=False):
-        printed.add_row(*(escape(str(value)) for value in row))
+        printed.add_row(*map(escape, map(str, row)))
     return printed
 
 
@@ -193,7 +193,7 @@ def _parts(frame: pd.DataFrame, width: int) -> Iterator[pd.DataFrame]:
     label = min(widths["setting"], 2 + max(_LABEL, *map(len, " ".join(frame["setting"]).split())))
     part = list(frame.columns[:3])
     for name in frame.columns[3:]:
-        if label + sum(widths[one] for one in part[1:]) + widths[name] > width:
+        if label + sum(map(widths.__getitem__, (*part[1:], name))) > width:
             yield frame[part]
             part = ["setting"]
         part.append(name)
@@ -224,29 +224,33 @@ def setting_tables(data: StudyData) -> Iterator[tuple[Any, Any, str]]:
     """
     episodes, setting = data.episodes, data.study.settings[0]
     over_all = [replace(row, task="all") for row in averaged(data.results) if row.tasks > 1]
-    rows = [_task_cells(row) for row in [*data.task_results, *over_all]]
+    rows = list(map(_task_cells, [*data.task_results, *over_all]))
     seeds = f"{episodes['seed'].min()}…{episodes['seed'].max()}"
     observation = setting.identity.get("observation", "")
     title = f"{setting.label}, observation {observation}{stress_text(setting.settings)}, seeds {seeds}"
     timed = episodes["seconds"].notna().all()
     if not timed:
         title += f"; not timed: {batch_of(setting.settings)} episodes at a time"
-    yield rows[0].keys(), [row.values() for row in rows], title
+    yield rows[0].keys(), list(map(dict.values, rows)), title
     if timed:
         decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()
-        sums = {phase: float(episodes[f"seconds.{phase}"].sum()) for phase in PHASES}
-        cells = [(phase, f"{1000 * s / decodes:.2f}", f"{s / total:.0%}") for phase, s in sums.items() if s]
+        cells = []
+        for phase in PHASES:
+            seconds = episodes[f"seconds.{phase}"].sum()
+            if seconds:
+                cells.append((phase, f"{1000 * seconds / decodes:.2f}", f"{seconds / total:.0%}"))
         yield ("phase", "ms per decode", "share"), cells, "time by phase"
 
 
 def _task_cells(row: Result) -> dict[str, str]:
     """Return a row of the table of a single setting as text, by the column's heading."""
     cells = cells_of(row)
-    names = ("steps per episode", "forwards per step", "tokens per verification")
     return {
         "task": row.task,
         "success": f"{row.measures.successes}/{row.episodes}",
-        **{name: cells[name] for name in names},
+        "steps per episode": cells["steps per episode"],
+        "forwards per step": cells["forwards per step"],
+        "tokens per verification": cells["tokens per verification"],
         "drafts accepted": number(row.measures.accepted_per_round),
         "time per step, ms": cells["time per step, ms"],
     }

@@ -22,7 +22,19 @@ from kerv_cli.lab.plan import Episode, Setting, seeds_text
 from kerv_cli.lab.store import Study
 from kerv_cli.report import statistics as stats
 from kerv_cli.report.measures import Speeds, compared, measure, paired, speedups
-from kerv_cli.report.results import MACRO, MICRO, ONE_TASK, Result, Row, averaged, columns_of, frame_of, is_number
+from kerv_cli.report.results import (
+    MACRO,
+    MICRO,
+    ONE_TASK,
+    Result,
+    Row,
+    averaged,
+    columns_of,
+    distinct,
+    frame_of,
+    is_number,
+    values_of,
+)
 from kerv_cli.report.statistics import PairedCounts
 from kerv_cli.report.tally import Tally
 from kerv_cli.report.verdict import with_matched_speed
@@ -140,7 +152,7 @@ class StudyData:
         Empty if the settings run under several conditions, or if fewer than two were timed.
         """
         timed = [row for row in averaged(self.results) if is_number(row.speed)]
-        order = [row.label for row in sorted(timed, key=attrgetter("speed"), reverse=True)]
+        order = values_of(sorted(timed, key=attrgetter("speed"), reverse=True), "label")
         if len(order) < 2 or len(set(self.references.values())) > 1:
             return []
         next_ones = dict(itertools.pairwise(order))
@@ -191,8 +203,9 @@ def references_of(settings: Sequence[Setting], baseline: str) -> dict[str, str]:
     same: dict[str, str] = {}
     for own in settings:
         if own.label == baseline:
-            group = [one for one in settings if _methods_of(one) == _methods_of(own)]
-            same = {_conditions_of(one): one.label for one in [*group, own]}
+            for one in (*settings, own):
+                if _methods_of(one) == _methods_of(own):
+                    same[_conditions_of(one)] = one.label
     return {one.label: same.get(_conditions_of(one), baseline) for one in settings}
 
 
@@ -225,7 +238,7 @@ def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyDa
     """
     study = study.load()
     if wanted is not None:
-        labels = {one.setting.label for one in wanted}
+        labels = distinct(wanted, "setting.label")
         settings = tuple(setting for setting in study.settings if setting.label in labels)
         study = replace(study, settings=settings, episodes=tuple(wanted))
     frame = study.frame(wanted)
@@ -262,7 +275,7 @@ def _with_new_seeds(episodes: pd.DataFrame) -> list[pd.DataFrame]:
 
 def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
     """Add the columns difficulty, device, dtype and threads to the episodes."""
-    added = {"difficulty": episodes["task"].map({task: difficulty_of(task) for task in set(episodes["task"])})}
+    added = {"difficulty": episodes["task"].map(difficulty_of)}
     for name in _RUNTIME:
         values = {setting.label: setting.settings["runtime"][name] for setting in study.settings}
         added[name] = episodes["label"].map(values)
@@ -297,7 +310,10 @@ def tally_of(study: Study, episodes: Sequence[int]) -> Tally | None:
 
 def difficulty_of(task: str) -> str:
     """Return the task's difficulty group, or `other` if no environment has the task."""
-    return next((spec.tasks[task].difficulty for spec in specs().values() if task in spec.tasks), "other")
+    for spec in specs().values():
+        if task in spec.tasks:
+            return spec.tasks[task].difficulty
+    return "other"
 
 
 def _results(data: StudyData, averaging: str) -> list[Result]:
@@ -368,7 +384,8 @@ def _over_runs(runs: Sequence[Mapping[Hashable, Speeds]], group: Hashable, same_
     several = [run.get(group, Speeds()) for run in runs]
     if len(several) == 1:
         return several[0]
-    return Speeds(*(stats.over_runs(speeds, same_pairs) for speeds in zip(*several, strict=True)))
+    over_runs = functools.partial(stats.over_runs, same_pairs=same_pairs)
+    return Speeds(*map(over_runs, zip(*several, strict=True)))
 
 
 def _series_of(setting: Setting, axis: str) -> str:
@@ -400,8 +417,12 @@ def flatten(settings: Plain) -> Row:
 
 def differences(first: Row, second: Row) -> list[tuple[str, Any, Any]]:
     """Return every key whose values differ, with both values. A value is None if that side does not have the key."""
-    keys = [key for key in first | second if first.get(key) != second.get(key)]
-    return [(key, first.get(key), second.get(key)) for key in keys]
+    found = []
+    for key in first | second:
+        ours, theirs = first.get(key), second.get(key)
+        if ours != theirs:
+            found.append((key, ours, theirs))
+    return found
 
 
 def _joined(values: Iterable[object]) -> str:
@@ -457,7 +478,7 @@ def _further_measures(row: Result) -> Row:
 
 def is_stressed(results: Iterable[Result]) -> bool:
     """Return whether a study compares several kinds or levels of stress (disturbed worlds, docs/stress.md)."""
-    return len({(row.stress, row.stress_level) for row in results}) > 1
+    return len(set(map(attrgetter("stress", "stress_level"), results))) > 1
 
 
 def summed_table(results: Iterable[Result]) -> pd.DataFrame:
@@ -472,7 +493,7 @@ def summed_table(results: Iterable[Result]) -> pd.DataFrame:
     """
     rows = [row for row in averaged(results) if row.stress != NO_STRESS]
     reference = next((row.unstressed for row in rows if row.is_baseline), "")
-    kinds, levels = {row.stress for row in rows}, {f"level {row.stress_level}" for row in rows}
+    kinds, levels = distinct(rows, "stress"), map("level {}".format, distinct(rows, "stress_level"))
     sums = []
     for name in (*sorted(kinds), *sorted(levels), "all"):
         methods: dict[str, list[Result]] = {}
@@ -487,8 +508,8 @@ def summed_table(results: Iterable[Result]) -> pd.DataFrame:
 
 def _pooled(rows: Sequence[Result]) -> dict[str, Any]:
     """Return the success of several settings together, and how it compares with their baselines."""
-    episodes, successes = sum(row.episodes for row in rows), sum(row.measures.successes for row in rows)
-    counts = PairedCounts(*np.sum([row.measures.counts for row in rows], axis=0).tolist())
+    episodes, successes = sum(values_of(rows, "episodes")), sum(values_of(rows, "measures.successes"))
+    counts = PairedCounts(*np.sum(values_of(rows, "measures.counts"), axis=0).tolist())
     success = {"episodes": episodes, "successes": successes, "success": stats.wilson(successes, episodes)}
     return success | compared(counts, stats.paired_difference(counts))
 

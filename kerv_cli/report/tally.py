@@ -54,7 +54,7 @@ class Tally:
     @classmethod
     def of_records(cls, decodes: Iterable[DecodeRecord], dofs: int) -> Tally:
         """Count the verifications of some decodes. `dofs` is the number of DoFs of an action."""
-        rounds = itertools.chain.from_iterable(decode.rounds for decode in decodes)
+        rounds = itertools.chain.from_iterable(map(attrgetter("rounds"), decodes))
         verified = filter(attrgetter("is_verification"), rounds)
         numbers = [(one.start, len(one.drafted), one.accepted, one.tree_size) for one in verified]
         start, judged, accepted, nodes = np.array(numbers, int).reshape(-1, 4).T

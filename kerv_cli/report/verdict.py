@@ -10,6 +10,7 @@ shows it. If the baseline succeeds in less than the share `SOLVED` of its episod
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ from operator import attrgetter
 from kerv_cli.base.durations import count
 from kerv_cli.report import statistics as stats
 from kerv_cli.report.measures import MARGIN
-from kerv_cli.report.results import Result, Row, averaged, columns_of, is_number
+from kerv_cli.report.results import Result, Row, averaged, columns_of, distinct, is_number, values_of
 
 SOLVED = 0.20
 """Smallest success rate at which the baseline counts as solving its tasks."""
@@ -83,10 +84,11 @@ def choices(results: Iterable[Result], task_results: Iterable[Result], loss: flo
         task_results: The study's rows per task.
         loss: Largest acceptable loss of success against the baseline, in points.
     """
-    tasks: dict[str, list[Result]] = {}
-    for row in sorted(task_results, key=lambda row: row.task):
-        tasks.setdefault(row.task, []).append(row)
-    return [choose("all tasks", averaged(results), loss), *(choose(task, tasks[task], loss) for task in tasks)]
+    found, of_task = [choose("all tasks", averaged(results), loss)], attrgetter("task")
+    for task, group in itertools.groupby(sorted(task_results, key=of_task), of_task):
+        rows = list(group)
+        found.append(choose(task, rows, loss))
+    return found
 
 
 def choose(where: str, rows: Sequence[Result], loss: float) -> Choice:
@@ -103,7 +105,7 @@ def choose(where: str, rows: Sequence[Result], loss: float) -> Choice:
     if undecided.is_unsolved:
         return undecided
     order = safest_first(rows)
-    undecided = replace(undecided, front=tuple(row.label for row in pareto(rows)), tested=len(order))
+    undecided = replace(undecided, front=tuple(values_of(pareto(rows), "label")), tested=len(order))
     best = _fastest(passing(order, loss / POINTS))
     if best is None:
         return _with_candidate(undecided, order, loss)
@@ -215,7 +217,7 @@ def with_matched_speed(rows: Sequence[Result]) -> list[Result]:
             groups.setdefault((row.where, row.method, row.baseline), []).append(row)
     fastest: dict[tuple[str, str, str], float] = {}
     for key, group in groups.items():
-        speeds = [row.measures.episode_speedup.value for row in passing(sorted(group, key=safety), MARGIN)]
+        speeds = values_of(passing(sorted(group, key=safety), MARGIN), "speed")
         fastest[key] = max((speed for speed in speeds if speed > 0), default=math.nan)
     matched = []
     for row in rows:
@@ -235,18 +237,13 @@ def verdict_of(results: Sequence[Result], loss: float) -> tuple[str, bool]:
         The sentence, and whether a setting is shown both to be faster and to lose less than `loss`.
     """
     rows = averaged(results)
-    if not any(row.is_compared for row in rows):
+    if not any(values_of(rows, "is_compared")):
         rates = ", ".join(f"{row.label} {POINTS * row.measures.success.value:.1f} %" for row in rows)
         return f"success: {rates}.", False
-    if len(baselines_of(rows)) > 1:
+    if len(distinct(rows, "baseline")) > 1:
         return f"{under_conditions(rows)}.", False
     found = choose("all tasks", rows, loss)
     return f"{sentence(found, loss, rows[0].baseline)}.", found.is_shown
-
-
-def baselines_of(rows: Sequence[Result]) -> list[str]:
-    """Return the labels of the settings that others are compared with, each once."""
-    return list(dict.fromkeys(row.baseline for row in rows))
 
 
 def question(results: Sequence[Result], loss: float) -> str:
@@ -256,10 +253,10 @@ def question(results: Sequence[Result], loss: float) -> str:
         results: The study's rows over all tasks.
         loss: Largest acceptable loss of success, in points.
     """
-    baselines = baselines_of([row for row in results if row.measures.pairs])
+    baselines = distinct(filter(attrgetter("measures.pairs"), results), "baseline")
     if len(baselines) > 1:
         return "Which settings succeed less or more often than the baseline under the same stress and clock?"
-    if not baselines or all(row.is_baseline for row in results):
+    if not baselines or all(values_of(results, "is_baseline")):
         return ""
     return f"Which setting is faster than the baseline {baselines[0]} and loses less than {loss:g} points of success?"
 
@@ -310,7 +307,7 @@ def episodes_to_settle(results: Sequence[Result], loss: float) -> int:
         loss: Largest acceptable loss of success, in points.
     """
     rows = averaged(results)
-    if len(baselines_of(rows)) > 1:
+    if len(distinct(rows, "baseline")) > 1:
         return 0
     pairs = choose("all tasks", rows, loss).candidate_pairs
     return math.ceil(pairs / rows[0].tasks) if pairs <= stats.MOST_PAIRS else 0
@@ -374,7 +371,7 @@ def under_conditions(rows: Sequence[Result]) -> str:
     Args:
         rows: The study's rows, pooled over tasks.
     """
-    method = next(row.method for row in rows if row.is_baseline)
+    method = next(filter(attrgetter("is_baseline"), rows)).method
     less, more = [], []
     failing: dict[str, None] = {}
     for row in rows:

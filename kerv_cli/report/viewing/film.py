@@ -6,6 +6,7 @@ import functools
 import io
 import itertools
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -60,9 +61,10 @@ def _read(path: Path, changed: int) -> Film:
             if steps[-1]:
                 hz = 1e9 * steps[-1] / batch["time"].cast("int64")[-1].as_py()
         elif chunk.entity_path == "/__properties/episode":
-            names = [field.name for field in batch.schema if not field.name.startswith("rerun.")]
-            facts |= {name: batch[name][0].as_py()[0] for name in names}
-    return Film(tuple(blob for _, blob in sorted(frames)), hz, facts, changed)
+            for name in batch.schema.names:
+                if not name.startswith("rerun."):
+                    facts[name] = batch[name][0].as_py()[0]
+    return Film(tuple(map(itemgetter(1), sorted(frames))), hz, facts, changed)
 
 
 def animation(film: Film, slower: float = 1.0) -> bytes:

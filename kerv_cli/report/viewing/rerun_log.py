@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from operator import itemgetter
 
 import numpy as np
 import rerun as rr
@@ -20,6 +21,7 @@ from rerun.error_utils import catch_and_log_exceptions
 
 from kerv_cli.base.registry import parts
 from kerv_cli.engine.record import PHASES, EpisodeRecord
+from kerv_cli.report.results import values_of
 from kerv_cli.report.viewing.token_outcomes import (
     OUTCOMES,
     acceptance,
@@ -176,24 +178,28 @@ def _log_world(log: _Log, record: EpisodeRecord) -> None:
 def _log_tokens(log: _Log, record: EpisodeRecord) -> None:
     """Log for each decode: its mode, the outcome of each token of its chunk as coloured bars, and a table."""
     starts, names = np.asarray(record.decode_steps, dtype=np.int64), record.space.names
-    turns = [str(number % 2) for number in range(len(starts))]  # the viewer joins equal neighbours, so alternate
+    size = chunk_size(record.decodes, len(names))
+    turns, changes, modes, texts, kinds = [], [], [], [], []
+    for number, (decode, step) in enumerate(zip(record.decodes, record.decode_steps, strict=True)):
+        turns.append(str(number % 2))  # the viewer joins equal neighbours, so alternate
+        if not modes or decode.mode != modes[-1]:
+            changes.append(number)
+            modes.append(decode.mode)
+        chunk = outcomes_of(decode, size, len(names))
+        kinds.append(values_of(chunk, "kind"))
+        texts.append(decode_table(decode, number, step, chunk, names))
     log.states("decodes", starts, turns, {"0": ("·", 0x55606BFF), "1": ("·", GREY)})
-    modes = [decode.mode for decode in record.decodes]
-    changes = [i for i in range(len(modes)) if i == 0 or modes[i] != modes[i - 1]]
     shades = {mode: part.colour << 8 | 0xFF for mode, part in parts("proposer").items() if part.colour is not None}
     shades |= {"ar": GREY, "skip": YELLOW}
     looks = {}
     for number, mode in enumerate(sorted(set(modes))):
         looks[mode] = readable(mode), shades.get(mode, COLORS[number % len(COLORS)])
-    log.states("mode", starts[changes], [modes[i] for i in changes], looks)
-    size = chunk_size(record.decodes, len(names))
-    chunks = [outcomes_of(decode, size, len(names)) for decode in record.decodes]
+    log.states("mode", starts[changes], modes, looks)
     looks = {kind: (style.symbol, style.color) for kind, style in OUTCOMES.items()}
     for index in range(size):
         step, dof = divmod(index, len(names))
-        log.states(f"tokens/step_{step}/{_part(names[dof])}", starts, [chunk[index].kind for chunk in chunks], looks)
-    decodes = zip(record.decodes, record.decode_steps, chunks, strict=True)
-    texts = [decode_table(d, number, step, chunk, names) for number, (d, step, chunk) in enumerate(decodes)]
+        states = map(itemgetter(index), kinds)
+        log.states(f"tokens/step_{step}/{_part(names[dof])}", starts, list(states), looks)
     media = ["text/markdown"] * len(texts)
     log.rows("decode/table", starts, rr.TextDocument.columns(text=texts, media_type=media))
 
@@ -209,23 +215,23 @@ def _log_numbers(log: _Log, record: EpisodeRecord) -> None:
     steps, starts = np.arange(record.steps + 1, dtype=np.int64), np.asarray(record.decode_steps, dtype=np.int64)
     log.numbers("actions", steps[:-1], names, record.actions)
     log.numbers("gripper", steps, ["gripper opening"], record.gripper[:, None], [YELLOW])
-    log.numbers("decode/forwards", starts, ["forwards"], [(d.forwards,) for d in decodes], [GREY])
+    log.numbers("decode/forwards", starts, ["forwards"], zip(values_of(decodes, "forwards"), strict=True), [GREY])
     per_verification = [acceptance([d]) for d in decodes]
     titles = ["tokens committed per verification (AL)", "drafts accepted per verification"]
     log.numbers("decode/acceptance", starts, titles, per_verification, [0x56B4E9FF, 0x009E73FF])
-    limits = [threshold_of(d) for d in decodes]
-    if all(min(r, default=0) == max(r, default=0) for r in limits):
+    limits = list(map(threshold_of, decodes))
+    if all(len(set(limit)) < 2 for limit in limits):
         log.numbers("decode/threshold", starts, ["r"], [r[:1] for r in limits])
     else:
         log.numbers("decode/threshold", starts, [f"r {name}" for name in names], limits)
-    times = {"total": [1000 * d.seconds for d in decodes]}
+    times = {"total": 1000 * np.array(values_of(decodes, "seconds"))}
     for phase in PHASES:
         milliseconds = [1000 * d.phases.get(phase, 0.0) for d in decodes]
         if any(milliseconds):
             times[phase] = milliseconds
     log.numbers("decode/phases", starts, list(times), np.transpose(list(times.values())), [GREY, *COLORS])
     for signal, title in SIGNALS.items():
-        log.numbers(f"signals/{signal}", starts, [title], [(getattr(d, signal),) for d in decodes])
+        log.numbers(f"signals/{signal}", starts, [title], zip(values_of(decodes, signal), strict=True))
 
 
 STEP, TIME = "step", "time"
@@ -252,7 +258,7 @@ def blueprint(record: EpisodeRecord) -> rrb.Blueprint:
     episode = rrb.TextDocumentView(origin="/summary", name="Episode")
     world = [rrb.Spatial2DView(origin="/camera", name="Camera")] if record.frames else []
     series = [_series("Per decode", "decode/forwards", "decode/acceptance")]
-    if any(threshold_of(d) for d in record.decodes):
+    if any(map(threshold_of, record.decodes)):
         series.append(_series("Acceptance threshold r, bins", "decode/threshold"))
     for signal, title in SIGNALS.items():
         if any(getattr(d, signal) is not None for d in record.decodes):
@@ -289,7 +295,7 @@ def _series(name: str, *entities: str) -> rrb.TimeSeriesView:
     """
     return rrb.TimeSeriesView(
         origin="/",
-        contents=[f"/{entity}" for entity in entities],
+        contents=list(map("/{}".format, entities)),
         name=name,
         axis_x=rrb.TimeAxis(link="LinkToGlobal"),
         plot_legend=rrb.PlotLegend(corner="LeftTop", visible=True),

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import itertools
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import numpy as np
+
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
 from kerv_cli.episodes.identity import hash_of
+from kerv_cli.report.results import values_of
 
 
 class OutcomeStyle(NamedTuple):
@@ -62,7 +66,7 @@ class TokenOutcome:
 
 def threshold_of(decode: DecodeRecord) -> tuple[int, ...]:
     """Return the acceptance threshold r of each DoF in a decode, in bins. Empty if the acceptance rule has none."""
-    return next((r.threshold for r in decode.rounds if r.threshold), ())
+    return next(filter(None, values_of(decode.rounds, "threshold")), ())
 
 
 def chunk_size(decodes: Sequence[DecodeRecord], dofs: int) -> int:
@@ -77,8 +81,9 @@ def chunk_size(decodes: Sequence[DecodeRecord], dofs: int) -> int:
     """
     most = 1
     for decode in decodes:
-        judged = [r.start + max(len(r.drafted), len(r.target_tokens)) for r in decode.rounds]
-        most = max(most, decode.size, len(decode.tokens), len(decode.actions) * dofs, *judged)
+        most = max(most, decode.size, len(decode.tokens), len(decode.actions) * dofs)
+        for one in decode.rounds:
+            most = max(most, one.start + max(len(one.drafted), len(one.target_tokens)))
     return -(-most // dofs) * dofs
 
 
@@ -143,9 +148,9 @@ def acceptance(decodes: Iterable[DecodeRecord]) -> tuple[float, ...]:
         Mean number of committed tokens, and mean number of accepted draft tokens, per verification. Empty if the
         decodes have no verification.
     """
-    rounds = itertools.chain.from_iterable(decode.rounds for decode in decodes)
+    rounds = itertools.chain.from_iterable(values_of(decodes, "rounds"))
     counts = [(one.committed, one.accepted) for one in rounds if one.is_verification]
-    return tuple(sum(column) / len(counts) for column in zip(*counts, strict=True))
+    return tuple(np.mean(counts, axis=0).tolist()) if counts else ()
 
 
 _SHOWN_SYMBOLS = "→✓≈–…≤≥αφσ"  # and those of OUTCOMES, which are among them or in Latin-1
@@ -161,12 +166,12 @@ def readable(text: str) -> str:
 
 def tokens_hash(decodes: Sequence[DecodeRecord]) -> str:
     """Return a hash of all tokens of an episode, decode by decode."""
-    return hash_of([list(decode.tokens) for decode in decodes])
+    return hash_of(list(map(list, values_of(decodes, "tokens"))))
 
 
 def facts_of(record: EpisodeRecord, method: str) -> dict[str, str | float]:
     """Return the totals of an episode, which the recording stores as its properties."""
-    modes = [decode.mode for decode in record.decodes]
+    modes = Counter(values_of(record.decodes, "mode"))
     facts: dict[str, str | float] = {
         "environment": readable(record.environment),
         "task": readable(record.task),
@@ -175,15 +180,15 @@ def facts_of(record: EpisodeRecord, method: str) -> dict[str, str | float]:
         "seed": record.seed,
         "success": record.success,
         "steps": record.steps,
-        "decodes": len(modes),
-        "modes": ", ".join(f"{modes.count(mode)} {readable(mode)}" for mode in dict.fromkeys(modes)),
+        "decodes": len(record.decodes),
+        "modes": ", ".join(f"{number} {readable(mode)}" for mode, number in modes.items()),
         "forwards": record.forwards,
         "forwards_per_step": record.forwards / record.steps,
         "ms_per_step": 1000 * record.seconds / record.steps,
         "inference_seconds": record.seconds,
         "wall_seconds": record.wall_seconds,
-        "skipped_decodes": sum(d.skipped for d in record.decodes),
-        "compensated_tokens": sum(d.compensated for d in record.decodes),
+        "skipped_decodes": sum(values_of(record.decodes, "skipped")),
+        "compensated_tokens": sum(values_of(record.decodes, "compensated")),
     }
     names = ("acceptance_length", "accepted_per_round")
     return facts | dict(zip(names, acceptance(record.decodes)))  # noqa: B905 - there may be none

@@ -26,7 +26,7 @@ _START_SECONDS = 2.0
 
 def recordings_below(folder: Path) -> Iterator[Path]:
     """Return the .rrd files in a folder and its subfolders, except hidden files."""
-    return (path for path in folder.rglob("[!.]*.rrd") if path.is_file())
+    return filter(Path.is_file, folder.rglob("[!.]*.rrd"))
 
 
 def find_recordings(paths: Iterable[Path]) -> list[Path]:
@@ -76,7 +76,7 @@ def open_recording(paths: Sequence[Path]) -> str:
         read_chunks(path)
     more = f" (the newest {len(chosen)} of {len(paths)})" if len(paths) > len(chosen) else ""
     if not has_display():
-        own = {path: _own_name(path) for path in chosen}
+        own = dict(zip(chosen, map(_own_name, chosen), strict=True))
         lines = [shlex.join(["scp", f"{socket.gethostname()}:{path.absolute()}", name]) for path, name in own.items()]
         lines += [shlex.join(["rerun", *own.values()])]
         where = "no display here{}: type on a machine that has one (pip install 'rerun-sdk==0.41.*')"
