@@ -7,7 +7,6 @@ import re
 import torch
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.limits import check_settings
 from kerv_cli.base.settings import RuntimeSettings
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
@@ -22,9 +21,8 @@ def set_up(settings: RuntimeSettings) -> tuple[str, torch.dtype]:
         The device (`auto` is resolved to cpu or cuda), and the number format.
 
     Raises:
-        UsageError: The device does not exist on this machine, or a setting is out of range.
+        UsageError: The device does not exist on this machine.
     """
-    check_settings(settings, "runtime")
     device = settings.device if settings.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
     if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
         raise UsageError(f"runtime.device={device}: known are cpu, cuda, cuda:N, auto")

@@ -149,9 +149,8 @@ def decoders(model: Model) -> list[Decoder]:
         return Decoder(target, Parts(rule, everything, draft, proposer))
 
     every = [decoder()]
-    for rows in range(2, size):
-        if size % rows == 0:  # all rounds commit equally many tokens
-            every.append(decoder(rows - 1, Dummy(rows - 1)))
+    # drafts of which all rounds commit equally many tokens
+    every += [decoder(rows - 1, Dummy(rows - 1)) for rows in range(2, size) if size % rows == 0]
     every += [decoder(0, Dummy(size - 2)), decoder(size - 1), decoder(max(_MERGED, size - 1))]
     for shape in ((size - 2, 1, size - 2), (min(3, size - 2), 1, 3), _TREE):
         every.append(decoder(0, DrafterProposer(model.drafter, target, *shape)))

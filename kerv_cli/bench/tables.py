@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from kerv_cli.base.rows import values_of
 from kerv_cli.bench.expected import TABLES, nearest_table
 from kerv_cli.bench.physics import DEVICES
 from kerv_cli.bench.prices import ACTION, ANCHORS, Answer, Estimate, Projection
-from kerv_cli.report.results import values_of
 
 if TYPE_CHECKING:
     from kerv_cli.bench.described import Described

@@ -13,9 +13,9 @@ import numpy as np
 from kerv_cli.base import manifests
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.limits import number
+from kerv_cli.base.rows import values_of
 from kerv_cli.engine.cost import COUNTED, READ_PHASES, Work, work_of
 from kerv_cli.engine.record import PARALLEL
-from kerv_cli.report.results import values_of
 
 MOST = 1_000_000  # of every count in a trace
 MODES = ("forward", "skip", PARALLEL)

@@ -11,11 +11,11 @@ import numpy as np
 import pandas as pd
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.rows import values_of
 from kerv_cli.bench.expected import Decodes, Drafts
 from kerv_cli.bench.trace import TracedDecode, grouped, work_of_trace
 from kerv_cli.engine.cost import prices
 from kerv_cli.report.profiles import NamedProfile
-from kerv_cli.report.results import values_of
 
 _RESAMPLES = 200
 _SEED = 0

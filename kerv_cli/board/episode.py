@@ -25,12 +25,12 @@ from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
 from kerv_cli.base.errors import NO_RERUN, KervError, has_rerun
+from kerv_cli.base.rows import values_of
 from kerv_cli.board.pages import CONTENT_POLICY, database_of, inside, render
 from kerv_cli.board.recorder import Recorder
 from kerv_cli.catalogue.episodes import FoundEpisode, find_episode, outcomes
 from kerv_cli.engine.record import PHASES, DecodeRecord
 from kerv_cli.lab.store import IMPORT
-from kerv_cli.report.results import values_of
 from kerv_cli.report.viewing.film import Film, animation, film_of
 from kerv_cli.report.viewing.token_outcomes import OUTCOMES, chunk_size, outcomes_of, tokens_hash
 from kerv_cli.report.viewing.viewer import viewer_command

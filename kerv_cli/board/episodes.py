@@ -12,6 +12,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from kerv_cli.base.errors import UnknownName
+from kerv_cli.base.rows import distinct, values_of
 from kerv_cli.board import episode
 from kerv_cli.board.pages import database_of, render
 from kerv_cli.catalogue.episodes import outcomes, settings_in
@@ -19,7 +20,6 @@ from kerv_cli.episodes.identity import stress_of
 from kerv_cli.lab.plan import Setting
 from kerv_cli.lab.store import Study
 from kerv_cli.report.measures import NEAR
-from kerv_cli.report.results import distinct, values_of
 from kerv_cli.report.tables import references_of
 
 SUCCESS, FAILURE, LOST, WON, ERROR, MISSING = "success", "failure", "lost", "won", "error", "missing"

@@ -12,10 +12,10 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.rows import values_of
 from kerv_cli.board.pages import database_of, refreshed, render
 from kerv_cli.catalogue.entries import RunEntry, find_runs
 from kerv_cli.report.compare import compare, pairs_to_compare
-from kerv_cli.report.results import values_of
 
 STATES: dict[str, Callable[[RunEntry], bool]] = {
     "running": lambda run: run.is_running,

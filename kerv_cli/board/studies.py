@@ -13,12 +13,12 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.rows import values_of
 from kerv_cli.board.pages import database_of, refreshed, render
 from kerv_cli.catalogue.entries import find_runs, parents
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import RUNNING, run_rows
 from kerv_cli.lab.store import Study
-from kerv_cli.report.results import values_of
 
 _SHARE = 0.01
 """Largest share of each core's time for refreshing the page of a running study, so that its times are not disturbed."""

@@ -7,9 +7,9 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from kerv_cli.base.errors import KervError, UsageError
+from kerv_cli.base.rows import values_of
 from kerv_cli.board.pages import database_of, refreshed, render
 from kerv_cli.catalogue.entries import RunEntry, children, description_of, disk_bytes, find_run, find_runs, parents
-from kerv_cli.report.results import values_of
 from kerv_cli.report.tables import flatten
 
 

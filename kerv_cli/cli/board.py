@@ -12,7 +12,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import number, setting
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, end_at_once, end_with_json
+from kerv_cli.cli.common import AsJson, database_of, end_at_once, end_with_json
 
 BOARD_FILE = "static/board.css"
 """File of every exported board. A folder that has it is replaced."""
@@ -36,11 +36,10 @@ class BoardSettings(CommandSettings):
 def board(settings: BoardSettings) -> None:
     """Look at runs, studies, trainings and episodes in the browser, until Ctrl-C; only this machine can."""
     from kerv_cli.board.app import serve
-    from kerv_cli.lab.database import opened
     from kerv_cli.report.viewing.viewer import has_display
 
     serve(
-        opened(settings.results),
+        database_of(settings),
         settings.port,
         lambda address: typer.echo(f"{address}  (Ctrl-C ends it)"),
         settings.open and has_display(),
@@ -60,11 +59,10 @@ def export(settings: CommandSettings, names: list[str], as_json: AsJson = False)
     from kerv_cli.base.files import write_folder
     from kerv_cli.board.export import export_board
     from kerv_cli.catalogue.entries import disk_bytes, find_run
-    from kerv_cli.lab.database import opened
 
     if not names:
         raise UsageError("name a folder to write to, as in 'kerv board export shared'")
-    folder, database, files = Path(names[0]).expanduser(), opened(settings.results), list[Path]()
+    folder, database, files = Path(names[0]).expanduser(), database_of(settings), list[Path]()
     if folder.exists() and not (folder / BOARD_FILE).is_file() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder} holds other files: name another folder")
     runs = [find_run(database, name).id for name in names[1:]]

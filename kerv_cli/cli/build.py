@@ -5,7 +5,7 @@ from __future__ import annotations
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.paths import artifact
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, as_planned, print_figures
+from kerv_cli.cli.common import AsJson, ShowPlan, as_planned, database_of, print_figures
 from kerv_cli.targets import TargetPart
 from kerv_cli.targets.settings import BuildTargetSettings
 from kerv_cli.training.settings import BuildDatastoreSettings, BuildDrafterSettings
@@ -30,10 +30,9 @@ def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
     if importer is None:
         imported = ", ".join(name for name, part in TargetPart.every().items() if part.importer)
         raise UsageError(f"family={settings.family}: only {imported} is imported, others are trained")
-    from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import making
 
-    with making(opened(settings.results), "target", artifact(settings.results, "target", settings.name)):
+    with making(database_of(settings), "target", artifact(settings.results, "target", settings.name)):
         folder, figures = importer(settings)
     print_figures("target", figures, folder, as_json)
 
@@ -51,13 +50,12 @@ def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
     """Import a drafter in the public EAGLE or Spec-VLA layout for a target."""
     if not settings.checkpoint:
         raise UsageError("checkpoint=DIR: name the folder of a drafter (config.json, model.safetensors)")
-    from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import making
     from kerv_cli.methods.artifacts import Artifacts
     from kerv_cli.training.drafter import import_drafter
 
     folder = Artifacts(settings.results, settings.policy).new("drafter")
-    with making(opened(settings.results), "drafter", folder):
+    with making(database_of(settings), "drafter", folder):
         folder, figures = import_drafter(settings)
     print_figures("drafter", figures, folder, as_json)
 
@@ -73,10 +71,8 @@ def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
 )
 def datastore(settings: BuildDatastoreSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Store the demonstrations' action chunks with the target's features as search keys, for drafts by retrieval."""
-    from kerv_cli.lab.database import opened
     from kerv_cli.training.datastore import build_datastore
 
-    database = opened(settings.results)
-    with as_planned(database, plan, as_json) as begin:
+    with as_planned(settings, plan, as_json) as (database, begin):
         folder, store = build_datastore(settings, database, begin)
     print_figures("datastore", {"entries": len(store.vectors), "tasks": len(store.shards)}, folder, as_json)

@@ -24,12 +24,10 @@ from kerv_cli.training.settings import CalibrateSettings, CalibrateSuccessSettin
 )
 def constants(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
     """Fit the constants of KERV and HeiSD: predictors, variability per task, boundary ranges and skip levels."""
-    from kerv_cli.lab.database import opened
     from kerv_cli.report.calibration import tables
     from kerv_cli.training.calibration import calibrate
 
-    database = opened(settings.results)
-    with as_planned(database, plan) as begin:
+    with as_planned(settings, plan) as (database, begin):
         path, calibration, notes = calibrate(settings, database, begin)
     for table in tables(calibration, path):
         print_table(*table)

@@ -19,6 +19,7 @@ import typer
 
 from kerv_cli.base.errors import Interrupted, KervError, UsageError
 from kerv_cli.base.limits import description
+from kerv_cli.base.settings import CommandSettings
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -206,22 +207,32 @@ def with_results(message: str, words: Iterable[str]) -> str:
     return re.sub(r"(['`])(kerv [a-z].*?)\1(?!\w)", complete, message)
 
 
+def database_of(settings: CommandSettings) -> Database:
+    """Open the database of the results folder."""
+    from kerv_cli.lab.database import opened  # imports SQLAlchemy, which --help and mistyped settings must not wait for
+
+    return opened(settings.results)
+
+
 @contextmanager
-def as_planned(database: Database, plan: bool = False, as_json: bool = False) -> Iterator[Begin]:
+def as_planned(
+    settings: CommandSettings, plan: bool = False, as_json: bool = False
+) -> Iterator[tuple[Database, Begin]]:
     """Open a `with` block in which an artifact is made. At the end of the block, store in the database how it ended.
 
     Args:
-        database: The database of the results folder.
+        settings: Settings of the command.
         plan: Print what would be made, and how long it takes, and end the command.
         as_json: Print the plan as JSON.
 
     Yields:
-        A function that the code in the block calls once the settings are checked. It writes the command's row in the
-        database. With `plan` it prints the plan instead.
+        The database of the results folder, and a function that the code in the block calls once the settings are
+        checked. The function writes the command's row in the database. With `plan` it prints the plan instead.
     """
     from kerv_cli.lab import runs
     from kerv_cli.lab.command import current_command
 
+    database = database_of(settings)
     with ExitStack() as stack:
 
         def begin(kind: str, folder: Path, what: str, units: int) -> Stage:
@@ -230,7 +241,7 @@ def as_planned(database: Database, plan: bool = False, as_json: bool = False) ->
             run = stack.enter_context(runs.making(database, kind, folder))
             return lambda title: progress_bar(title, run)
 
-        yield begin
+        yield database, begin
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from kerv_cli.base.durations import count
 from kerv_cli.base.errors import Interrupted, UsageError
 from kerv_cli.base.paths import artifact
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import ShowPlan, as_planned, print_table, progress_bar
+from kerv_cli.cli.common import ShowPlan, as_planned, database_of, print_table, progress_bar
 from kerv_cli.training.settings import DemosSettings
 from kerv_cli.worlds.settings import DemosImportSettings
 
@@ -24,7 +24,6 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
 
     With policy=NAME a policy acts instead, and the expert labels the states that it reaches (DAgger).
     """
-    from kerv_cli.lab.database import opened
     from kerv_cli.training.dagger import recording_of
     from kerv_cli.training.demonstrations import name_of
     from kerv_cli.worlds.demos.recording import record
@@ -34,7 +33,7 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
     folder = artifact(settings.results, "demos", settings.name or name_of(settings.task))
     what = f"{count(len(config.tasks), 'task')} x {count(settings.episodes, 'episode')} -> {folder}"
     try:
-        with as_planned(opened(settings.results), plan) as begin:
+        with as_planned(settings, plan) as (_, begin):
             stage = begin("demos", folder, what, len(config.tasks) * settings.episodes)
             with stage("demonstrations") as advance:
                 manifest = record(config, folder, advance, actor)
@@ -57,14 +56,13 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
 )
 def import_demos(settings: DemosImportSettings) -> None:
     """Read a LeRobot dataset as demonstrations."""
-    from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import making
     from kerv_cli.worlds.demos.lerobot import import_lerobot
 
     if not settings.source:
         raise UsageError("source=DIR: name the folder of a LeRobot dataset")
     folder = artifact(settings.results, "demos", settings.name or Path(settings.source).name)
-    with making(opened(settings.results), "demos", folder) as made, progress_bar("import", made) as advance:
+    with making(database_of(settings), "demos", folder) as made, progress_bar("import", made) as advance:
         manifest = import_lerobot(settings, folder, advance).manifest
     rows = ((name, len(row.episodes), f"{row.mean_steps:.0f}") for name, row in manifest.tasks.items())
     title = f"demonstrations in {folder}" + ("" if settings.environment else f", suite {manifest.environment.upper()}")

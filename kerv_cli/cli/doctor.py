@@ -17,7 +17,7 @@ from kerv_cli.base.limits import number, setting
 from kerv_cli.base.paths import check_writable, find_target, results_dir, shipped_dir
 from kerv_cli.base.settings import RunSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, end_with_json, print_table
+from kerv_cli.cli.common import AsJson, database_of, end_with_json, print_table
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.worlds.findings import Finding, find, need
 from kerv_cli.worlds.settings import EVALUATION_SEED, WorldSettings
@@ -169,10 +169,9 @@ def _disk(settings: DoctorSettings) -> str:
 
 def _database(settings: DoctorSettings) -> str:
     """Return which database is used, as text. Raises KervError if it does not answer."""
-    from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import run_rows
 
-    database = opened(settings.results)
+    database = database_of(settings)
     rows = len(run_rows(database))
     what = "PostgreSQL" if database.file is None else "SQLite"
     says = f"{rows} commands in it" if database.exists else "made by the first command that needs it"

@@ -11,7 +11,7 @@ from kerv_cli.base.limits import setting
 from kerv_cli.base.paths import as_path
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, console, end_with_json
+from kerv_cli.cli.common import AsJson, console, database_of, end_with_json
 
 
 @dataclass(kw_only=True)
@@ -34,7 +34,6 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
     """Import the runs of another results folder, or evaluations of vla-eval as a study."""
     from kerv_cli.catalogue.evaluations import import_evaluations
     from kerv_cli.catalogue.imports import database_in, import_databases
-    from kerv_cli.lab.database import opened
     from kerv_cli.lab.store import Study
     from kerv_cli.report.summary import SummaryTable
     from kerv_cli.report.tables import load_study
@@ -43,7 +42,7 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
         raise UsageError("name what to import: kerv runs import old-results, or kerv runs import recording-ID.sqlite")
     paths = list(map(as_path, names))
     files = list(filter(None, map(database_in, paths)))
-    database = opened(settings.results)
+    database = database_of(settings)
     if files:
         if len(files) < len(paths):
             raise UsageError("import results folders and evaluations one after the other")

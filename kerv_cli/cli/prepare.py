@@ -9,7 +9,7 @@ import typer
 
 from kerv_cli.base.errors import Interrupted
 from kerv_cli.cli.command import command, commands, typer_command
-from kerv_cli.cli.common import ShowPlan, print_table, results_word
+from kerv_cli.cli.common import ShowPlan, database_of, print_table, results_word
 from kerv_cli.training.settings import PrepareSettings
 
 NOT_OF_STEPS = ("for", "steps", "quick")
@@ -28,12 +28,11 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
 
     Existing artifacts are skipped. The same command continues after an interruption.
     """
-    from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import time_of
     from kerv_cli.training.preparation import THERE
     from kerv_cli.training.preparation import plan as planned
 
-    database, name = opened(settings.results), settings.policy.target
+    database, name = database_of(settings), settings.policy.target
     steps = planned(settings, database)
     lines, rows = {}, []
     for step in steps:

@@ -19,6 +19,7 @@ from kerv_cli.cli.common import (
     AsJson,
     ShowPlan,
     console,
+    database_of,
     end_with_json,
     end_with_plan,
     print_rows,
@@ -76,10 +77,9 @@ def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a r
 def list_(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """List the runs of a results folder, the newest first."""
     from kerv_cli.catalogue.entries import few, find_runs, matching
-    from kerv_cli.lab.database import opened
 
     filters = dict(word.partition("=")[::2] for word in names)
-    runs = matching(find_runs(opened(settings.results)), filters)
+    runs = matching(find_runs(database_of(settings)), filters)
     if as_json:
         end_with_json(list(map(_entry_row, runs)))
     if not runs:
@@ -101,12 +101,11 @@ def _entry_row(run: RunEntry) -> dict[str, object]:
 def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Show one run, ID or ID:SETTING: its command, its results, the artifacts it was made from, its folder."""
     from kerv_cli.catalogue.entries import disk_bytes, find_runs, parents, store_of
-    from kerv_cli.lab.database import opened
     from kerv_cli.report.compare import compared_runs
     from kerv_cli.report.summary import SummaryTable
     from kerv_cli.report.tables import load_study
 
-    database, (name,) = opened(settings.results), _run_names(names)
+    database, (name,) = database_of(settings), _run_names(names)
     chosen = compared_runs(database, name)
     run = chosen[0].run
     data = load_study(store_of(run, database)) if run.has_episodes and run.episodes else None
@@ -139,7 +138,6 @@ def label(settings: CommandSettings, names: list[str]) -> None:
     """Write tags and a note to a run. `kerv runs list tag=…`, the board and exports show them."""
     from kerv_cli.catalogue.entries import find_run
     from kerv_cli.catalogue.labels import LABELS, set_labels
-    from kerv_cli.lab.database import opened
 
     changes: dict[str, str] = {}
     others = []
@@ -152,7 +150,7 @@ def label(settings: CommandSettings, names: list[str]) -> None:
     (name,) = _run_names(others)
     if not changes:
         raise UsageError(f"write tag= or note=, as in 'kerv runs label {name} tag=baseline'")
-    database = opened(settings.results)
+    database = database_of(settings)
     run = find_run(database, name)
     set_labels(database, run.id, run.labels | changes)
     typer.echo(", ".join([run.id, *(f"{kind} {text}" for kind, text in (run.labels | changes).items() if text)]))
@@ -168,10 +166,9 @@ def label(settings: CommandSettings, names: list[str]) -> None:
 def watch(settings: CommandSettings, names: list[str]) -> None:
     """Follow what runs, from any terminal, until it ends: how far it is, and how long it takes."""
     from kerv_cli.catalogue.entries import find_run, find_runs
-    from kerv_cli.lab.database import opened
     from kerv_cli.lab.runs import BEAT_SECONDS
 
-    database, shown = opened(settings.results), dict[str, str]()
+    database, shown = database_of(settings), dict[str, str]()
     chosen = find_run(database, _run_names(names)[0]).id if names else ""
     while True:
         runs = {run.id: run for run in find_runs(database) if chosen in ("", run.id)}
@@ -192,11 +189,10 @@ def watch(settings: CommandSettings, names: list[str]) -> None:
 @_command_on_runs("compare", "kerv runs compare main:ar main:kerv", "kerv runs compare main last")
 def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Compare two runs, ID or ID:SETTING: differences in settings, and in results with confidence intervals."""
-    from kerv_cli.lab.database import opened
     from kerv_cli.report import compare as comparing
 
     runs = _run_names(names, 2, 2, "two runs, ID or ID:SETTING")
-    comparisons = list(starmap(comparing.compare, comparing.pairs_to_compare(opened(settings.results), *runs)))
+    comparisons = list(starmap(comparing.compare, comparing.pairs_to_compare(database_of(settings), *runs)))
     if as_json:
         end_with_json(comparisons)
     for comparison in comparisons:
@@ -225,9 +221,8 @@ def rerun(
 ) -> None:
     """Repeat a sweep or rollout under a new name, and say whether the tokens are the same."""
     from kerv_cli.catalogue.entries import find_run
-    from kerv_cli.lab.database import opened
 
-    database, (name,) = opened(settings.results), _run_names(names)
+    database, (name,) = database_of(settings), _run_names(names)
     run = find_run(database, name)
     if run.kind not in ("sweep", "rollout"):
         made = f", which '{run.command_line}' makes" if run.command else ""
@@ -255,9 +250,8 @@ def rerun(
 def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     """Remove runs and everything in their folders, after asking for confirmation."""
     from kerv_cli.catalogue.entries import check_removable, disk_bytes, find_run, remove
-    from kerv_cli.lab.database import opened
 
-    database = opened(settings.results)
+    database = database_of(settings)
     runs, total = [], 0
     for name in _run_names(names, 1, 1000):
         runs.append(find_run(database, name, exact=yes))
@@ -282,11 +276,10 @@ def export(
 ) -> None:
     """Write the episodes of a run as CSV, Parquet, a trace, or a database that 'kerv runs import' reads."""
     from kerv_cli.catalogue.entries import find_run
-    from kerv_cli.lab.database import opened
     from kerv_cli.report.export import export as hand_over
 
     (name,) = _run_names(names)
-    database = opened(settings.results)
+    database = database_of(settings)
     folder = folder or database.results / "exports" / to
     written = hand_over(find_run(database, name), database, to, folder)
     if as_json:

@@ -49,11 +49,9 @@ def drafter(settings: TrainDrafterSettings, plan: ShowPlan = False, as_json: AsJ
 
 def _train(train: Callable[..., tuple[Path, dict[str, float]]], settings: Any, plan: bool, as_json: bool) -> None:
     """Train, and print the metrics of the best weights, and where they and the curves are."""
-    from kerv_cli.lab.database import opened
     from kerv_cli.report.plots import save_curves
 
-    database = opened(settings.results)
-    with as_planned(database, plan, as_json) as begin:
+    with as_planned(settings, plan, as_json) as (database, begin):
         folder, metrics = train(settings, database, begin)
         plot = save_curves(folder)
     if as_json:

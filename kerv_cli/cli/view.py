@@ -9,6 +9,7 @@ import typer
 from kerv_cli.base.errors import UnknownName
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
+from kerv_cli.cli.common import database_of
 
 
 @command(
@@ -23,15 +24,15 @@ def view(settings: CommandSettings, names: list[str]) -> None:
     """Open recordings in the Rerun viewer; without a display, print the command that opens them."""
     from kerv_cli.report.viewing.viewer import find_recordings, open_recording
 
-    paths = [_place(settings.results, name) for name in names]
+    paths = [_place(settings, name) for name in names]
     typer.echo(open_recording(find_recordings(paths or filter(Path.is_dir, [Path(settings.results)]))))
 
 
-def _place(results: str, name: str) -> Path:
+def _place(settings: CommandSettings, name: str) -> Path:
     """Return the recording, or the folder of recordings, that an argument means.
 
     Args:
-        results: The results folder.
+        settings: Settings of the command.
         name: A path, the name of a run, or `last`: the newest run that has recordings.
 
     Raises:
@@ -41,15 +42,14 @@ def _place(results: str, name: str) -> Path:
     if path.exists() or path.suffix == ".rrd":
         return path
     from kerv_cli.catalogue.entries import LAST, find_run, find_runs
-    from kerv_cli.lab.database import opened
     from kerv_cli.report.viewing.viewer import recordings_below
 
-    database = opened(results)
+    database = database_of(settings)
     if name == LAST:
         for run in find_runs(database):
             if run.has_episodes and any(recordings_below(run.folder)):
                 return run.folder
-        return Path(results)
+        return Path(settings.results)
     try:
         return find_run(database, name).folder
     except UnknownName:

@@ -23,6 +23,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_json
 from kerv_cli.base.paths import beside, results_dir
 from kerv_cli.base.registry import METHOD_KINDS
+from kerv_cli.base.rows import values_of
 from kerv_cli.episodes.identity import ENGINE
 from kerv_cli.episodes.policy import artifacts_of
 from kerv_cli.episodes.resolve import ResolvedStudy
@@ -34,7 +35,6 @@ from kerv_cli.methods.certified.certificate import Attempt, Candidate, Certifica
 from kerv_cli.methods.compose import Method
 from kerv_cli.report.betting import p_value
 from kerv_cli.report.measures import paired
-from kerv_cli.report.results import values_of
 from kerv_cli.report.tables import load_study
 from kerv_cli.targets.provenance import provenance
 from kerv_cli.training.settings import CalibrateSuccessSettings

@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import pandas as pd
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.rows import distinct, values_of
 from kerv_cli.catalogue.entries import RunEntry, description_of, find_run, store_of
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, without
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.plan import seeds_text
 from kerv_cli.lab.store import Study
 from kerv_cli.report.measures import measure, paired
-from kerv_cli.report.results import Row, distinct, is_number, values_of
+from kerv_cli.report.results import Row, is_number
 from kerv_cli.report.statistics import Estimate
 from kerv_cli.report.summary import DIFFERENCE, SPEEDS
 from kerv_cli.report.tables import StudyData, differences, flatten, load_study, split_values

@@ -6,7 +6,6 @@ import base64
 import os
 import shlex
 from collections.abc import Sequence
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -82,7 +81,7 @@ def study_parts(
         "results": "" if results == "results" else f" results={shlex.quote(results)}",
         "baseline": data.study.baseline,
         "main": MAIN,
-        "explained": explanations(map(attrgetter("label", "method"), rows)),
+        "explained": explanations((row.label, row.method) for row in rows),
         "columns": f"{NOTE} {of_runs(rows)}",
         "suite": _suite(rows),
         "charts": [figure.to_dict() for figure in figures.values()],

@@ -21,7 +21,8 @@ from PIL import Image
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import write_if_changed
-from kerv_cli.report.results import Result, averaged, distinct, frame_of, is_number, values_of
+from kerv_cli.base.rows import distinct, values_of
+from kerv_cli.report.results import Result, averaged, frame_of, is_number
 from kerv_cli.report.summary import MAIN, summary_frame
 from kerv_cli.report.tables import NO_STRESS, is_stressed, latency_table
 from kerv_cli.report.tally import Tally

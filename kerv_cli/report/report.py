@@ -167,13 +167,9 @@ def refusals(results: Sequence[Result]) -> list[str]:
     for found, what in zip(values.values(), ("commits", "machines", "devices", "engines"), strict=True):
         if len(found) > 1:
             clauses.append(f"its episodes are from {len(found)} {what}")
-    other_run: dict[str, None] = {}
-    not_in_turn: dict[str, None] = {}
-    for row in results:
-        if row.is_compared and not row.measures.same_run:
-            other_run[row.label] = None
-        if row.is_compared and row.measures.same_block < 1:
-            not_in_turn[row.label] = None
+    compared = [row for row in results if row.is_compared]
+    other_run = dict.fromkeys(row.label for row in compared if not row.measures.same_run)
+    not_in_turn = dict.fromkeys(row.label for row in compared if row.measures.same_block < 1)
     for labels, what in ((other_run, "in one run with"), (not_in_turn, "in turn with")):
         if labels:
             clauses.append(f"not measured {what} the baseline: {', '.join(labels)}")

@@ -16,11 +16,12 @@ import pandas as pd
 import pyarrow.compute as pc
 
 from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.rows import values_of
 from kerv_cli.engine.cost import COUNTED, READ_PHASES, Profile, Work, prices, read_profile, work_of
 from kerv_cli.episodes.identity import batch_of
 from kerv_cli.report.measures import measure, paired
 from kerv_cli.report.profiles import ENCODERS, NamedProfile, open_profiles
-from kerv_cli.report.results import Measures, Result, Row, averaged, columns_of, values_of
+from kerv_cli.report.results import Measures, Result, Row, averaged, columns_of
 from kerv_cli.report.summary import interval
 from kerv_cli.report.tables import StudyData
 

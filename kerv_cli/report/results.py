@@ -10,7 +10,6 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from numbers import Real
-from operator import attrgetter
 from typing import Any
 
 import pandas as pd
@@ -228,16 +227,6 @@ def columns_of(values: Mapping[str, Any]) -> Row:
 def frame_of(results: Iterable[Result]) -> pd.DataFrame:
     """Return rows as a data frame. A missing value is NaN."""
     return pd.DataFrame(map(columns_of, map(vars, results)))
-
-
-def values_of(rows: Iterable[Any], name: str) -> list[Any]:
-    """Return an attribute of each row, such as `label` or `measures.counts`."""
-    return list(map(attrgetter(name), rows))
-
-
-def distinct(rows: Iterable[Any], name: str) -> list[Any]:
-    """Return the different values of an attribute, in the order of the rows."""
-    return list(dict.fromkeys(map(attrgetter(name), rows)))
 
 
 def averaged(results: Iterable[Result], averaging: str = MICRO) -> list[Result]:

@@ -15,9 +15,10 @@ from rich.table import Table
 from rich.text import Text
 
 from kerv_cli.base.durations import count
+from kerv_cli.base.rows import distinct, values_of
 from kerv_cli.engine.record import PHASES
 from kerv_cli.episodes.identity import batch_of, stress_text
-from kerv_cli.report.results import MICRO, Result, averaged, distinct, is_number, values_of
+from kerv_cli.report.results import MICRO, Result, averaged, is_number
 from kerv_cli.report.statistics import Estimate
 from kerv_cli.report.tables import StudyData
 
@@ -66,12 +67,8 @@ def interval(estimate: Estimate, form: str = ".2f", unit: str = "", scale: float
     value, low, high = estimate.value * scale, estimate.low * scale, estimate.high * scale
     ends = ".1f" if form == ".2f" and value >= 10 else form
     shown = f"{value:{ends.replace('.0f', '.1f')}}".removesuffix(".0") + unit
-    return _minus(f"{shown} ({low:{ends}}{between}{high:{ends}})" if is_number(low) else shown)
-
-
-def _minus(text: str) -> str:
-    """Return the text with proper minus signs and without a sign before zero."""
-    return text.replace("+0 ", "0 ").replace("-0 ", "0 ").replace("-", "−")
+    text = f"{shown} ({low:{ends}}{between}{high:{ends}})" if is_number(low) else shown
+    return text.replace("+0 ", "0 ").replace("-0 ", "0 ").replace("-", "−")  # no sign before zero
 
 
 def _speed(row: Result, speed: Estimate) -> str:

@@ -17,24 +17,13 @@ import pandas as pd
 import pyarrow.compute as pc
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.rows import distinct, values_of
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, flat, stress_of, without
 from kerv_cli.lab.plan import Episode, Setting, seeds_text
 from kerv_cli.lab.store import Study
 from kerv_cli.report import statistics as stats
 from kerv_cli.report.measures import Speeds, compared, measure, paired, speedups
-from kerv_cli.report.results import (
-    MACRO,
-    MICRO,
-    ONE_TASK,
-    Result,
-    Row,
-    averaged,
-    columns_of,
-    distinct,
-    frame_of,
-    is_number,
-    values_of,
-)
+from kerv_cli.report.results import MACRO, MICRO, ONE_TASK, Result, Row, averaged, columns_of, frame_of, is_number
 from kerv_cli.report.statistics import PairedCounts
 from kerv_cli.report.tally import Tally
 from kerv_cli.report.verdict import with_matched_speed

@@ -17,9 +17,10 @@ from dataclasses import dataclass, replace
 from operator import attrgetter
 
 from kerv_cli.base.durations import count
+from kerv_cli.base.rows import distinct, values_of
 from kerv_cli.report import statistics as stats
 from kerv_cli.report.measures import MARGIN
-from kerv_cli.report.results import Result, Row, averaged, columns_of, distinct, is_number, values_of
+from kerv_cli.report.results import Result, Row, averaged, columns_of, is_number
 
 SOLVED = 0.20
 """Smallest success rate at which the baseline counts as solving its tasks."""

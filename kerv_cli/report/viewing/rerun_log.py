@@ -20,8 +20,8 @@ from PIL import Image
 from rerun.error_utils import catch_and_log_exceptions
 
 from kerv_cli.base.registry import parts
+from kerv_cli.base.rows import values_of
 from kerv_cli.engine.record import PHASES, EpisodeRecord
-from kerv_cli.report.results import values_of
 from kerv_cli.report.viewing.token_outcomes import (
     OUTCOMES,
     acceptance,

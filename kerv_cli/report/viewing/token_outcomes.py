@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from kerv_cli.base.rows import values_of
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
 from kerv_cli.episodes.identity import hash_of
-from kerv_cli.report.results import values_of
 
 
 class OutcomeStyle(NamedTuple):
