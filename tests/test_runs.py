@@ -18,8 +18,7 @@ import sqlalchemy as sa
 from command import kerv
 from studies_synthetic import swept, threshold_study
 
-from kerv_cli.catalogue.entries import find_runs, matching
-from kerv_cli.catalogue.labels import labels_in
+from kerv_cli.catalogue.entries import find_runs, labels_in, matching
 from kerv_cli.lab.database import EPISODES, RUNS, WANTED, opened
 from kerv_cli.lab.runs import INTERRUPTED, Run
 from kerv_cli.lab.study import EpisodeRunner

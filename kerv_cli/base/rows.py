@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from operator import attrgetter
-from typing import Any
+from typing import Any, TypeVar
+
+T = TypeVar("T")
 
 
 def values_of(rows: Iterable[Any], name: str) -> list[Any]:
@@ -15,3 +17,8 @@ def values_of(rows: Iterable[Any], name: str) -> list[Any]:
 def distinct(rows: Iterable[Any], name: str) -> list[Any]:
     """Return the different values of an attribute, in the order of the rows."""
     return list(dict.fromkeys(map(attrgetter(name), rows)))
+
+
+def keyed(rows: Iterable[T], name: str) -> dict[Any, T]:
+    """Return the rows by the value of an attribute, such as `label`."""
+    return {getattr(row, name): row for row in rows}

@@ -8,10 +8,8 @@ from operator import itemgetter
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.rows import values_of
 from kerv_cli.bench.expected import Decodes, Drafts
 from kerv_cli.bench.trace import TracedDecode, grouped, work_of_trace
 from kerv_cli.engine.cost import prices
@@ -58,7 +56,8 @@ def _ratio(one: np.ndarray, other: np.ndarray, chosen: np.ndarray) -> list[float
 
 def _numbers(decodes: Sequence[TracedDecode]) -> np.ndarray:
     """Return the number of each decode's episode, from 0, (decodes,)."""
-    return pd.factorize(np.array(values_of(decodes, "episode")))[0]
+    numbers: dict[str, int] = {}
+    return np.array([numbers.setdefault(one.episode, len(numbers)) for one in decodes])
 
 
 def _resampled(

@@ -7,6 +7,7 @@ import csv
 import dataclasses
 import fnmatch
 import io
+import json
 import os
 import re
 import shlex
@@ -14,6 +15,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +27,10 @@ from kerv_cli.base.leftovers import clean, temporary_beside
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.paths import shipped_dir
 from kerv_cli.base.registry import ArtifactPart
+from kerv_cli.base.rows import keyed
 from kerv_cli.base.settings import CommandSettings
-from kerv_cli.catalogue.labels import labels_in, set_labels
 from kerv_cli.episodes.identity import OBSERVATION
-from kerv_cli.lab.database import EPISODES, SETTINGS, STUDIES, WANTED, Database
+from kerv_cli.lab.database import ABOUT, EPISODES, SETTINGS, STUDIES, WANTED, Database
 from kerv_cli.lab.plan import ALL, Episode
 from kerv_cli.lab.runs import COMPLETE, RUNNING, RunRow, forget, interrupted, run_rows, time_left
 from kerv_cli.lab.store import IMPORT, ROLLOUT, SWEEP, Study
@@ -39,6 +41,10 @@ LAST = "last"
 """Stands for the newest entry, as an argument of commands."""
 _STUDIES = (SWEEP, ROLLOUT, IMPORT)
 _STATES = ("complete", "begun", "damaged", "step ", "running", "interrupted", "failed")
+LABELS = ("tag", "note")
+"""Kinds of labels. `tag` holds words, separated by commas; `note` is free text."""
+_ABOUT = "labels of "
+"""Beginning of the key of a run's labels in the table `about`. There is a row for each run that has any."""
 _FILTERS = ("kind", "method", "task", "state", "since", "tag")
 
 
@@ -186,7 +192,7 @@ def find_run(database: Database, name: str, exact: bool = False) -> RunEntry:
         raise UsageError(f"no runs in {database.results}: make one with 'kerv rollout method=spec_vla task=reach'")
     if name == LAST and not exact:
         return runs[0]
-    by_id = {run.id: run for run in runs}
+    by_id = keyed(runs, "id")
     found = [name] if name in by_id or exact else [one for one in by_id if name in one]
     if len(found) > 1:
         raise UsageError(f"'{name}' is a part of {len(found)} runs: {', '.join(found[:5])}")
@@ -411,6 +417,23 @@ def children(run: RunEntry, runs: Sequence[RunEntry]) -> list[RunEntry]:
 def disk_bytes(folder: Path) -> int:
     """Return the total size of all files in a folder, in bytes."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def labels_in(database: Database) -> dict[str, dict[str, str]]:
+    """Return the labels of all runs that have any, by the id of the run."""
+    rows = sa.select(ABOUT).where(ABOUT.c.key.startswith(_ABOUT))
+    with database.reading() as connection, database.checking("a label"):
+        return {row.key.removeprefix(_ABOUT): json.loads(row.value) for row in connection.execute(rows)}
+
+
+def set_labels(database: Database, run: str, labels: Mapping[str, str]) -> None:
+    """Replace the labels of a run, given its id. Empty labels are removed."""
+    kept = dict(filter(itemgetter(1), labels.items()))
+    with database.writing() as connection:
+        connection.execute(sa.delete(ABOUT).where(ABOUT.c.key == _ABOUT + run))
+        if kept:
+            text = json.dumps(kept, ensure_ascii=False)
+            connection.execute(sa.insert(ABOUT).values(key=_ABOUT + run, value=text))
 
 
 def check_removable(run: RunEntry) -> None:

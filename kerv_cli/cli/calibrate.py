@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -11,6 +14,9 @@ from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, as_planned, end_with_json, print_rows, print_table, settings_yaml
 from kerv_cli.episodes.settings import SweepSettings
 from kerv_cli.training.settings import CalibrateSettings, CalibrateSuccessSettings
+
+if TYPE_CHECKING:
+    from kerv_cli.methods.calibration import Calibration
 
 
 @command(
@@ -24,15 +30,49 @@ from kerv_cli.training.settings import CalibrateSettings, CalibrateSuccessSettin
 )
 def constants(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
     """Fit the constants of KERV and HeiSD: predictors, variability per task, boundary ranges and skip levels."""
-    from kerv_cli.report.calibration import tables
     from kerv_cli.training.calibration import calibrate
 
     with as_planned(settings, plan) as (database, begin):
         path, calibration, notes = calibrate(settings, database, begin)
-    for table in tables(calibration, path):
+    for table in _tables(calibration, path):
         print_table(*table)
     for line in notes:
         typer.echo(line)
+
+
+def _tables(calibration: Calibration, path: Path) -> Iterator[tuple[tuple[str, ...], list[tuple[object, ...]], str]]:
+    """Yield tables: K_S of each task, and thresholds of each task.
+
+    K_S is the reference level of a task's kinematic variability (docs/methods.md §3). The thresholds say when a
+    retrieved chunk may be executed without verification (§4). Without thresholds, the last table is left out.
+
+    Args:
+        calibration: The calibration.
+        path: The calibration's file, named in the title of the tables.
+
+    Yields:
+        Column names, rows and title of each table.
+    """
+    columns: tuple[str, ...] = ("task", "fitted on", "decodes", "K_S")
+    rows: list[tuple[object, ...]] = []
+    for name, counts in calibration.demos.tasks.items():
+        row = calibration.variability.get(name)
+        levels = [row.decodes, f"{row.k_s:.3f}"] if row else ["-"] * 2
+        rows.append((name, counts["training"], *levels))
+    yield columns, rows, f"calibration in {path}"
+
+    skip = calibration.skip
+    if skip is None:
+        return
+    rows = []
+    for name, task in skip.tasks.items():
+        levels = [f"{x:.4f}" for x in (task.s_min, task.low, task.high)] if task.share else ["never", "-", "-"]
+        figures = [f"{task.within:.1%}", f"{task.error:.4f}"] if task.share else ["-", "-"]
+        rows.append((name, *levels, f"{task.share:.1%}", *figures, task.entries))
+    limit = f"error ≤ {skip.epsilon:g}"
+    columns = ("task", "s_min", "low", "high", "would be skipped", limit, "mean error", "entries")
+    best = f"best neighbour in another episode, {skip.confidence:.0%} with an error of at most {skip.epsilon:g}"
+    yield columns, rows, f"verify-skip, {best}"
 
 
 OF_TEST = {at.name for at in fields(CalibrateSuccessSettings)} - {at.name for at in fields(SweepSettings)}

@@ -48,7 +48,7 @@ def rollout(
 
     resolved = resolve_rollout(overrides, multirun)
     if cfg:
-        typer.echo("---\n".join(settings_yaml(settings) for settings in resolved.settings.values()), nl=False)
+        typer.echo("---\n".join(map(settings_yaml, resolved.settings.values())), nl=False)
         return
     planned = planned_study(resolved, ["rollout", *(["-m"] if multirun else []), *overrides], is_rollout=True)
     if plan:

@@ -136,8 +136,7 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
 )
 def label(settings: CommandSettings, names: list[str]) -> None:
     """Write tags and a note to a run. `kerv runs list tag=…`, the board and exports show them."""
-    from kerv_cli.catalogue.entries import find_run
-    from kerv_cli.catalogue.labels import LABELS, set_labels
+    from kerv_cli.catalogue.entries import LABELS, find_run, set_labels
 
     changes: dict[str, str] = {}
     others = []

@@ -217,8 +217,8 @@ def _means(episodes: pd.DataFrame, by: list[str]) -> pd.DataFrame:
     for _, arrays in groups["decode_seconds"]:
         milliseconds = 1000.0 * np.concatenate(list(arrays))
         latencies.append(np.quantile(milliseconds, list(quantiles.values())))
-    means = episodes[by].assign(**each).groupby(by).mean()
-    means[list(quantiles)] = latencies
+    percentiles = dict(zip(quantiles, np.transpose(latencies), strict=True))
+    means = episodes[by].assign(**each).groupby(by).mean().assign(**percentiles)
     sums = groups[list(dict.fromkeys(itertools.chain.from_iterable(_RATIOS.values())))].sum()
     for name, (above, below) in _RATIOS.items():
         means[name] = sums[above] / sums[below].mask(sums[below] == 0)

@@ -17,7 +17,7 @@ import pandas as pd
 import pyarrow.compute as pc
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.rows import distinct, values_of
+from kerv_cli.base.rows import distinct, keyed, values_of
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, flat, stress_of, without
 from kerv_cli.lab.plan import Episode, Setting, seeds_text
 from kerv_cli.lab.store import Study
@@ -79,7 +79,7 @@ class StudyData:
     @functools.cached_property
     def settings(self) -> dict[str, Setting]:
         """The settings by label."""
-        return {setting.label: setting for setting in self.study.settings}
+        return keyed(self.study.settings, "label")
 
     @functools.cached_property
     def labels(self) -> list[str]:
@@ -227,7 +227,7 @@ def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyDa
     """
     study = study.load()
     if wanted is not None:
-        labels = distinct(wanted, "setting.label")
+        labels = {one.setting.label for one in wanted}
         settings = tuple(setting for setting in study.settings if setting.label in labels)
         study = replace(study, settings=settings, episodes=tuple(wanted))
     frame = study.frame(wanted)
@@ -264,7 +264,7 @@ def _with_new_seeds(episodes: pd.DataFrame) -> list[pd.DataFrame]:
 
 def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
     """Add the columns difficulty, device, dtype and threads to the episodes."""
-    added = {"difficulty": episodes["task"].map(difficulty_of)}
+    added = {"difficulty": episodes["task"].map(functools.cache(difficulty_of))}
     for name in _RUNTIME:
         values = {setting.label: setting.settings["runtime"][name] for setting in study.settings}
         added[name] = episodes["label"].map(values)
@@ -334,6 +334,7 @@ def _results(data: StudyData, averaging: str) -> list[Result]:
             measures = replace(measures, **_over_runs(runs, group, data.same_pairs)._asdict())
         setting = data.settings[label]
         stress = stress_of(setting.settings)
+        hashes = {f"{name}_sha256": value for name, value in sorted(setting.identity.items()) if name != OBSERVATION}
         row = Result(
             study=data.name,
             averaging=averaging,
@@ -353,7 +354,7 @@ def _results(data: StudyData, averaging: str) -> list[Result]:
             overrides=setting.overrides,
             settings=flatten(without(setting.settings, NOT_DETERMINING - {"policy"})),
             observation=setting.identity.get(OBSERVATION, ""),
-            hashes=_hashes_of(setting),
+            hashes=hashes,
             stress=stress["kind"],
             stress_level=stress["level"],
             provenance={name: _joined(part[name].unique()) for name in _PROVENANCE},
@@ -384,12 +385,6 @@ def _series_of(setting: Setting, axis: str) -> str:
         if key != axis:
             words.append(f"{key.split('.')[-1]} {value}")
     return ", ".join(words)
-
-
-def _hashes_of(setting: Setting) -> dict[str, str]:
-    """Return the hashes of a setting's weights and data, by the name of their column."""
-    hashes = without(setting.identity, {OBSERVATION})
-    return {f"{name}_sha256": value for name, value in sorted(hashes.items())}
 
 
 def flatten(settings: Plain) -> Row:

@@ -346,18 +346,14 @@ def refuse_other(folder: Path, identity: str, kind: str, setting: str) -> None:
     Raises:
         CheckpointError: The folder holds another training.
     """
-    if stored_identity(folder) not in (None, identity):
+    try:
+        stored = torch.load(folder / RESUME, "cpu", mmap=True, weights_only=True)["identity"]
+    except _UNREADABLE:
+        return
+    if stored != identity:
         raise CheckpointError(
             f"{folder} holds a run with other settings or data: choose another {setting}=, or {removal(kind, folder)}"
         )
-
-
-def stored_identity(folder: Path) -> str | None:
-    """Return the identity hash in the folder's resume file; None if there is no file that can be read."""
-    try:
-        return str(torch.load(folder / RESUME, "cpu", mmap=True, weights_only=True)["identity"])
-    except _UNREADABLE:
-        return None
 
 
 def read_state(path: Path) -> dict[str, Any]:

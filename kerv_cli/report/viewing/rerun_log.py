@@ -179,7 +179,8 @@ def _log_tokens(log: _Log, record: EpisodeRecord) -> None:
     """Log for each decode: its mode, the outcome of each token of its chunk as coloured bars, and a table."""
     starts, names = np.asarray(record.decode_steps, dtype=np.int64), record.space.names
     size = chunk_size(record.decodes, len(names))
-    turns, changes, modes, texts, kinds = [], [], [], [], []
+    turns, changes, texts, kinds = [], [], [], []
+    modes: list[str] = []
     for number, (decode, step) in enumerate(zip(record.decodes, record.decode_steps, strict=True)):
         turns.append(str(number % 2))  # the viewer joins equal neighbours, so alternate
         if not modes or decode.mode != modes[-1]:
@@ -224,7 +225,7 @@ def _log_numbers(log: _Log, record: EpisodeRecord) -> None:
         log.numbers("decode/threshold", starts, ["r"], [r[:1] for r in limits])
     else:
         log.numbers("decode/threshold", starts, [f"r {name}" for name in names], limits)
-    times = {"total": 1000 * np.array(values_of(decodes, "seconds"))}
+    times = {"total": [1000 * d.seconds for d in decodes]}
     for phase in PHASES:
         milliseconds = [1000 * d.phases.get(phase, 0.0) for d in decodes]
         if any(milliseconds):
