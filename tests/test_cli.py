@@ -105,6 +105,14 @@ def test_help_settings_and_mistakes_of_every_command_need_no_torch():
     assert run.returncode == 0, run.stderr
 
 
+def test_every_command_is_found_by_its_first_word():
+    """Only the file of that word is imported when a command is typed."""
+    files = registry.MODULES["command"]
+    for name, part in parts("command").items():
+        file = f"kerv_cli.cli.{name.split()[0]}"
+        assert part.module not in files or part.module == file or file not in files
+
+
 def test_damaged_weights_are_refused(results):
     weights = results / "artifacts/target/nano-state/model.safetensors"
     weights.write_bytes(weights.read_bytes()[:-7])

@@ -27,8 +27,7 @@ from kerv_cli.base.errors import KervError, UnknownName, UsageError
 PLUGINS = "KERV_PLUGINS"
 
 _COMMANDS = (
-    "demos train prepare build calibrate rollout sweep work serve report runs importing board compare view estimate "
-    "bench doctor"
+    "demos train prepare build calibrate rollout sweep work serve report runs board compare view estimate bench doctor"
 )
 
 MODULES: Mapping[str, Sequence[str]] = {

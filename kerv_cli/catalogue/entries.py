@@ -275,7 +275,9 @@ def _studies(database: Database) -> Iterator[RunEntry]:
         for one in settings:
             if one.study_id == study.id:
                 methods[one.method] = None
-                _add_hashes(made_from, one.label, one.identity)
+                for kind, value in one.identity.items():
+                    if kind != OBSERVATION and value and value not in made_from.values():
+                        made_from[f"{kind} of {one.label}" if kind in made_from else kind] = value
         total = successes = existing = 0
         names, times = [], []
         for one in tasks:
@@ -297,13 +299,6 @@ def _studies(database: Database) -> Iterator[RunEntry]:
             figures={"success": successes / existing} if existing else {},
             made_from=made_from,
         )
-
-
-def _add_hashes(made_from: dict[str, str], label: str, identity: Mapping[str, str]) -> None:
-    """Add the hashes of a setting's weights and data that no earlier setting uses, see `RunEntry.made_from`."""
-    for kind, value in identity.items():
-        if kind != OBSERVATION and value and value not in made_from.values():
-            made_from[f"{kind} of {label}" if kind in made_from else kind] = value
 
 
 def description_of(run: RunEntry) -> dict[str, Any]:
@@ -473,11 +468,6 @@ def remove(run: RunEntry, database: Database) -> None:
     shutil.rmtree(gone, ignore_errors=True)
 
 
-def again_words(run: RunEntry, results: str) -> list[str]:
-    """Return the arguments after `kerv` that repeat a study. The same arguments resume an interrupted repetition."""
-    return ["runs", "rerun", run.id, *([] if results == CommandSettings().results else [f"results={results}"])]
-
-
 def plan_of(run: RunEntry, database: Database) -> Study:
     """Plan to run a sweep or a rollout again. If an earlier repetition was interrupted, plan the rest of that one.
 
@@ -495,7 +485,8 @@ def plan_of(run: RunEntry, database: Database) -> Study:
     new = {setting.label: checked(setting, study.tasks, results) for setting in study.settings}
     episodes = tuple(Episode(new[one.setting.label], one.task, one.seed, one.repeat) for one in study.episodes)
     study = dataclasses.replace(study, settings=tuple(new.values()), episodes=episodes)
-    command = again_words(run, results)
+    # the same command resumes an interrupted repetition
+    command = ["runs", "rerun", run.id, *([] if results == CommandSettings().results else [f"results={results}"])]
     row = interrupted(database, study.kind, command)
     if row is not None:
         name = row.name

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import itertools
 import json
@@ -136,7 +137,8 @@ def import_evaluations(
     if baseline not in by_label:
         raise UsageError(f"baseline={baseline}: the recordings are of {', '.join(by_label)}")
     settings: list[Setting] = []
-    episodes: dict[Episode, tuple[Evaluation, RecordedEpisode | None]] = {}
+    episodes: list[Episode] = []
+    existing: list[tuple[Episode, Evaluation, RecordedEpisode]] = []
     notes: list[str] = []
     for label, of_path in by_label.items():
         setting = Setting(label, "", _settings(of_path[0]), _identity(of_path))
@@ -144,11 +146,13 @@ def import_evaluations(
         for one in of_path:
             notes += _notes(label, one)
             for episode, recorded in _episodes(setting, one, len(benchmarks) > 1):
-                episodes[episode] = one, recorded
+                episodes.append(episode)
+                if recorded is not None:
+                    existing.append((episode, one, recorded))
     title = f"{HARNESS}: {', '.join(benchmarks)}"
     about = title, baseline, "", "; ".join(notes)
     study = Study(database, name, IMPORT, tuple(settings), tuple(episodes), *about)
-    study.add(_existing(database.results, episodes), words)
+    study.add(itertools.starmap(functools.partial(_imported, database.results), existing), words)
     return name, notes
 
 
@@ -323,15 +327,6 @@ def _identity(evaluations: Sequence[Evaluation]) -> dict[str, str]:
     digest = hashlib.sha256(json.dumps(recorded, sort_keys=True).encode()).hexdigest()
     hashes = {str(k): str(v) for k, v in dict(evaluations[0].facts.get("identity") or {}).items()}
     return {"target": "", **hashes, "evaluation": digest, OBSERVATION: "of the benchmark"}
-
-
-def _existing(
-    results: Path, episodes: Mapping[Episode, tuple[Evaluation, RecordedEpisode | None]]
-) -> Iterator[ImportedEpisode]:
-    """Yield the recorded episodes for the database."""
-    for episode, (one, recorded) in episodes.items():
-        if recorded is not None:
-            yield _imported(results, episode, one, recorded)
 
 
 def _imported(results: Path, episode: Episode, one: Evaluation, recorded: RecordedEpisode) -> ImportedEpisode:

@@ -106,8 +106,7 @@ def commands(words: str = "") -> dict[str, Command]:
     Args:
         words: Words, such as `train`. Empty: all commands.
     """
-    files, first = MODULES["command"], words.partition(" ")[0]
-    file = f"kerv_cli.cli.{'importing' if first == 'import' else first}"
+    files, file = MODULES["command"], f"kerv_cli.cli.{words.partition(' ')[0]}"
     found = parts("command", file if file in files else "")
     places = dict(zip(files, range(len(files)), strict=True))
     names = sorted(found, key=lambda name: places.get(found[name].module, len(files)))  # plugins last
