@@ -132,7 +132,7 @@ def _beside(texts: Sequence[str]) -> str:
 
 
 def trace_row(found: Mapping[str, Any]) -> dict[str, object]:
-    """Return a row about a setting of a trace, from `traced.price` or `traced.choose_length`."""
+    """Return a row about a setting of a trace, from `trace.price` or `trace.choose_length`."""
     if "best" not in found:
         row: dict[str, object] = {name: found[name] for name in ("setting", "tokens", "episodes", "decodes")}
         for name in ("decode", "episode"):

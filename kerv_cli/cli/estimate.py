@@ -97,8 +97,7 @@ def _trace(settings: EstimateSettings, as_json: bool) -> None:
     from kerv_cli.base.paths import as_path
     from kerv_cli.bench.described import described
     from kerv_cli.bench.tables import trace_row
-    from kerv_cli.bench.trace import read_trace
-    from kerv_cli.bench.traced import CANNOT, choose_length, price
+    from kerv_cli.bench.trace import CANNOT, choose_length, price, read_trace
 
     trace = read_trace(as_path(settings.trace))
     settings.prompt = settings.prompt or next(filter(None, values_of(trace, "prompt")), None)
