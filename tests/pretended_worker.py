@@ -7,10 +7,10 @@ import os
 
 import studies_synthetic
 
-from kerv_cli.lab import queue, study, work
+from kerv_cli.lab import work
 
-study.EpisodeRunner = lambda *_: getattr(studies_synthetic, os.environ["PRETENDED"])
-study.checked = lambda *_: None  # the weights are pretended, too
+work.EpisodeRunner = lambda *_: getattr(studies_synthetic, os.environ["PRETENDED"])
+work.checked = lambda *_: None  # the weights are pretended, too
 work.POLL_SECONDS = 0.05
-queue.LAPSE_SECONDS = float(os.environ.get("LAPSE", "30"))
-queue.BEAT_SECONDS = min(queue.BEAT_SECONDS, queue.LAPSE_SECONDS / 6)
+work.LAPSE_SECONDS = float(os.environ.get("LAPSE", "30"))
+work.BEAT_SECONDS = min(work.BEAT_SECONDS, work.LAPSE_SECONDS / 6)

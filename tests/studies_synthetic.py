@@ -23,11 +23,10 @@ from kerv_cli.episodes.identity import without
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database, opened
 from kerv_cli.lab.plan import Setting, all_episodes
-from kerv_cli.lab.progress import OnEvent, Outcome
 from kerv_cli.lab.runs import Run
 from kerv_cli.lab.store import Study
-from kerv_cli.lab.study import run_blocks
-from kerv_cli.lab.work import Prepare, RunEpisode
+from kerv_cli.lab.study import Outcome, run_blocks
+from kerv_cli.lab.work import OnEvent, Prepare, RunEpisode
 from kerv_cli.worlds import settled
 from kerv_cli.worlds.metaworld.spec import SPEC
 

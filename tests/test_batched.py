@@ -29,8 +29,7 @@ from kerv_cli.episodes import runner as run
 from kerv_cli.episodes.runner import Request, run_together
 from kerv_cli.lab.plan import Episode, Setting, blocks_of
 from kerv_cli.lab.store import Study
-from kerv_cli.lab.study import EpisodeRunner
-from kerv_cli.lab.work import RunEpisode
+from kerv_cli.lab.work import EpisodeRunner, RunEpisode
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.methods.parallel import ParallelPass

@@ -404,7 +404,7 @@ def test_a_full_disk_keeps_what_was_committed(tmp_path, monkeypatch):
     store = Study(opened(tmp_path), "threshold")
     assert store.counts() == (8, 40)
     assert len(store.frame()) == 8
-    monkeypatch.setattr("kerv_cli.lab.queue.LAPSE_SECONDS", 1.0)
+    monkeypatch.setattr("kerv_cli.lab.work.LAPSE_SECONDS", 1.0)
     swept(tmp_path, study)  # in this process, whose claim could not be released
     assert store.counts() == (40, 40)
 

@@ -19,8 +19,8 @@ from kerv_cli.engine.cost import Profile
 from kerv_cli.engine.record import PHASES, DecodeRecord, Delay, EpisodeRecord, Round
 from kerv_cli.episodes import policy as policies_of
 from kerv_cli.episodes import runner as run
-from kerv_cli.episodes.clock import RealClock, profiled, steps_during
-from kerv_cli.episodes.episode import run_episode
+from kerv_cli.episodes.episode import RealClock, run_episode, steps_during
+from kerv_cli.episodes.policy import profiled
 from kerv_cli.episodes.rows import decodes_table, episode_row
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD

@@ -37,10 +37,20 @@ from kerv_cli.cli.common import progress_bar
 from kerv_cli.cli.studies import event_printer
 from kerv_cli.lab.database import EPISODES, QUEUE, WANTED, Database, clock, opened
 from kerv_cli.lab.plan import blocks_of
-from kerv_cli.lab.progress import BlockStarted, EpisodeEnd, Event, Preparing, SettingFailed, Started, TimeLeft
-from kerv_cli.lab.queue import ClaimLost, Queue, enqueue
 from kerv_cli.lab.store import Study
-from kerv_cli.lab.work import work
+from kerv_cli.lab.study import TimeLeft
+from kerv_cli.lab.work import (
+    BlockStarted,
+    ClaimLost,
+    EpisodeEnd,
+    Event,
+    Preparing,
+    Queue,
+    SettingFailed,
+    Started,
+    enqueue,
+    work,
+)
 from kerv_cli.lab.workers import LocalWorkers, disturbances, gpus_in_turn
 from kerv_cli.report.tables import further_of, load_study
 from kerv_cli.worlds import EnvironmentPart
@@ -52,7 +62,7 @@ TWO = threshold_study(["reach-v3", "push-v3"])
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     monkeypatch.setattr("kerv_cli.lab.work.POLL_SECONDS", 0.02)
-    monkeypatch.setattr("kerv_cli.lab.workers._POLL_SECONDS", 0.02)
+    monkeypatch.setattr("kerv_cli.lab.study.FOLLOW_SECONDS", 0.02)
 
 
 def queued(database: Database) -> int:
@@ -169,8 +179,8 @@ SWEEP = """
 import os
 import sys
 import studies_synthetic as s
-from kerv_cli.lab import work, workers
-work.POLL_SECONDS = workers._POLL_SECONDS = 0.02
+from kerv_cli.lab import study, work
+work.POLL_SECONDS = study.FOLLOW_SECONDS = 0.02
 work.code_hash(), work.stamp("cpu")  # once, before the processes part
 study = s.threshold_study(["reach-v3", "push-v3"], episodes=2, radii=(3,))
 number, processes = int(sys.argv[3]), int(sys.argv[4])
@@ -185,7 +195,7 @@ if all(children):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_workers_of_a_killed_sweep_end_and_its_claims_are_taken_over(tmp_path, monkeypatch):
-    monkeypatch.setattr("kerv_cli.lab.queue.LAPSE_SECONDS", 1.0)
+    monkeypatch.setattr("kerv_cli.lab.work.LAPSE_SECONDS", 1.0)
     store = Study(opened(tmp_path), "threshold")
     with python(SWEEP, tmp_path, "slow_elsewhere", 2, 1) as process:  # the first task at once, the other in a minute
         until(lambda: store.counts()[0] == 6)
@@ -289,16 +299,16 @@ def test_no_two_workers_run_an_episode_that_two_studies_share(database):
 STOPS = """
 import sys
 import studies_synthetic as s
-from kerv_cli.lab import queue, work
+from kerv_cli.lab import work
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import Study
-queue.LAPSE_SECONDS, queue.BEAT_SECONDS = 1.0, 0.1
-work.work(queue.Queue(Study(opened(sys.argv[1]), "threshold")), s.stops)
+work.LAPSE_SECONDS, work.BEAT_SECONDS = 1.0, 0.1
+work.work(work.Queue(Study(opened(sys.argv[1]), "threshold")), s.stops)
 """
 
 
 def test_a_worker_that_was_stopped_loses_its_block_and_writes_nothing_twice(database, monkeypatch):
-    monkeypatch.setattr("kerv_cli.lab.queue.LAPSE_SECONDS", 1.0)
+    monkeypatch.setattr("kerv_cli.lab.work.LAPSE_SECONDS", 1.0)
     store = waiting(database, STUDY)
     with python(STOPS, database.results) as process:
         os.waitid(os.P_PID, process.pid, os.WSTOPPED)
@@ -315,7 +325,7 @@ import os
 import sys
 import pandas  # once, before the processes part; so are the calls below
 import studies_synthetic as s
-from kerv_cli.lab import database, queue, work
+from kerv_cli.lab import database, work
 from kerv_cli.lab.store import Study
 from kerv_cli.lab.database import Database, opened
 
@@ -334,7 +344,7 @@ def parted(function, *arguments, **options):
 
 
 def begun(store):
-    return parted(lambda: work.work(queue.Queue(Study(opened(results), store.name)), prepare))
+    return parted(lambda: work.work(work.Queue(Study(opened(results), store.name)), prepare))
 
 
 def crew(store, number):
@@ -345,7 +355,7 @@ def crew(store, number):
         workers.remove(child)
         if status:
             died += 1
-            assert queue.Queue(store).lapse(child)
+            assert work.Queue(store).lapse(child)
             workers.append(begun(store))
     return died
 """
@@ -357,7 +367,7 @@ for workers in (1, 2, 4):
             setting.settings["seed"] = 100_000 + 100 * block + 10 * workers
         episodes = s.all_episodes(study.settings, ["reach-v3"], block)
         study = s.replace(study, episodes=episodes)
-        queue.enqueue(s.plan_study(opened(results), study), "run")
+        work.enqueue(s.plan_study(opened(results), study), "run")
         died = crew(Study(opened(results), study.name), workers)
         print(study.name, died)
 """
@@ -375,7 +385,7 @@ def test_any_number_of_workers_run_each_episode_once_though_some_are_killed(data
 
 AT_ONCE = """
 study = s.threshold_study(["reach-v3", "push-v3"], episodes=4, radii=(3,), block=2)
-queue.enqueue(s.plan_study(opened(results), study), "earlier")
+work.enqueue(s.plan_study(opened(results), study), "earlier")
 store = Study(opened(results), study.name)
 children = [begun(store) for _ in range(3)] + [parted(s.swept, results, study, prepare) for _ in range(2)]
 assert [os.waitpid(child, 0)[1] for child in children] == [0] * 5
@@ -472,7 +482,7 @@ def test_a_worker_counts_its_episodes_without_a_total(capsys):
 IN_ORDER = """
 from test_execute import in_order
 study = in_order()
-queue.enqueue(s.plan_study(opened(results), study), "run")
+work.enqueue(s.plan_study(opened(results), study), "run")
 assert crew(Study(opened(results), study.name), 1) == 2
 """
 
@@ -634,12 +644,12 @@ def test_a_database_that_does_not_answer_is_asked_again_for_two_minutes(tmp_path
             if len(locks) > 1:
                 threading.Timer(0.5, locks[-1].close).start()
 
-    monkeypatch.setattr("kerv_cli.lab.queue.PATIENCE_SECONDS", 0.3)
+    monkeypatch.setattr("kerv_cli.lab.work.PATIENCE_SECONDS", 0.3)
     with refused("locked", "finished episodes are kept", error=StorageError):
         work(Queue(store), episodes_of, lock)
     locks[-1].close()
     assert store.counts() == (4, 16)
-    monkeypatch.setattr("kerv_cli.lab.queue.PATIENCE_SECONDS", 20.0)
+    monkeypatch.setattr("kerv_cli.lab.work.PATIENCE_SECONDS", 20.0)
     with store.database.writing() as connection:  # the block could not be freed
         connection.execute(sa.update(QUEUE).values(heartbeat=0.0))
     work(Queue(store), episodes_of, lock)

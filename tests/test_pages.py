@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 from studies_synthetic import swept, threshold_study
 
-from kerv_cli.report.page import render
+from kerv_cli.report.report import render
 from kerv_cli.report.tables import load_study
 from kerv_cli.report.viewing.film import Film
 
@@ -75,8 +75,10 @@ def test_a_report_has_a_film_of_one_success_and_one_failure_per_method(tmp_path,
         (store.rollouts / one.recording).touch()
     buffer = io.BytesIO()
     Image.new("RGB", (8, 8)).save(buffer, "jpeg")
-    monkeypatch.setattr("kerv_cli.report.page.film_of", lambda path: Film((buffer.getvalue(),), 80.0, {"steps": 4}, 0))
-    monkeypatch.setattr("kerv_cli.report.page.library", str)
+    monkeypatch.setattr(
+        "kerv_cli.report.report.film_of", lambda path: Film((buffer.getvalue(),), 80.0, {"steps": 4}, 0)
+    )
+    monkeypatch.setattr("kerv_cli.report.report.library", str)
     page = render(data, 3.0)
     expected = data.episodes.groupby("label")["success"].nunique().sum()
     assert page.count("data:image/webp;base64,") == expected > 3

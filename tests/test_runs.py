@@ -21,7 +21,7 @@ from studies_synthetic import swept, threshold_study
 from kerv_cli.catalogue.entries import find_runs, labels_in, matching
 from kerv_cli.lab.database import EPISODES, RUNS, WANTED, opened
 from kerv_cli.lab.runs import INTERRUPTED, Run
-from kerv_cli.lab.study import EpisodeRunner
+from kerv_cli.lab.work import EpisodeRunner
 
 FAST = ["policy=state", "policy.target=nano-state", "task=reach-v3", "world.horizon=8", "record=0"]
 

@@ -16,9 +16,9 @@ from studies_synthetic import swept, threshold_study, unhurried
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.settings import RuntimeSettings, SlurmOptions
 from kerv_cli.lab.database import EPISODES, QUEUE, opened
-from kerv_cli.lab.progress import EpisodeEnd
 from kerv_cli.lab.store import Study
 from kerv_cli.lab.study import Detached
+from kerv_cli.lab.work import EpisodeEnd
 
 STUDY = threshold_study(["reach-v3", "push-v3"], episodes=6, radii=(3,), block=2)
 CONFIGURATION = """

@@ -192,7 +192,7 @@ def test_every_setting_is_compared_with_ar_at_its_latency(delayed):
 
 
 def test_the_figure_has_a_panel_per_compensation_and_a_line_per_method(delayed):
-    figure = latency_figure(delayed[1])
+    figure = latency_figure(delayed[1], latency_table(delayed[1]))
     assert [panel.title for panel in figure.concat] == ["delay compensation: none", "delay compensation: chunk"]
     points = points_of(figure)[0]
     assert list(points["line"].unique()) == ["ar", "spec_vla"]

@@ -107,8 +107,7 @@ def record_episode(setting: Setting, task: str, seeds: list[int], results: str, 
     """
     from kerv_cli.episodes.runner import Runner
     from kerv_cli.episodes.settings import settings_from
-    from kerv_cli.lab.study import checked
-    from kerv_cli.lab.work import failure_of
+    from kerv_cli.lab.work import checked, failure_of
     from kerv_cli.report.viewing import save_recording
 
     try:

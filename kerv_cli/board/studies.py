@@ -36,7 +36,7 @@ def _parts(database: Database, name: str, version: str, is_running: bool) -> tup
         version: `Study.version` of the study. A study is read again only if its version has changed.
         is_running: Whether it runs. If so, no cost model estimates its speeds, which would take time from it.
     """
-    from kerv_cli.report.page import study_parts  # imports Altair, which takes a second
+    from kerv_cli.report.report import study_parts  # imports Altair, which takes a second
     from kerv_cli.report.reprice import own_profiles, prices_on
     from kerv_cli.report.tables import load_study
 

@@ -479,7 +479,8 @@ def plan_of(run: RunEntry, database: Database) -> Study:
         CheckpointError: The weights or data of the run have changed since.
         UsageError: A setting cannot run.
     """
-    from kerv_cli.lab.study import checked, new_name  # imports torch, which listing runs does not need
+    from kerv_cli.lab.study import new_name  # imports torch, which listing runs does not need
+    from kerv_cli.lab.work import checked
 
     results, study = str(database.results), store_of(run, database).load()
     new = {setting.label: checked(setting, study.tasks, results) for setting in study.settings}

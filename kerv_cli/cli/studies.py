@@ -22,8 +22,9 @@ from kerv_cli.cli.common import (
 
 if TYPE_CHECKING:
     from kerv_cli.episodes.resolve import ResolvedStudy
-    from kerv_cli.lab.progress import Event, Outcome, TimeLeft
     from kerv_cli.lab.store import Study
+    from kerv_cli.lab.study import Outcome, TimeLeft
+    from kerv_cli.lab.work import Event
     from kerv_cli.report.reprice import Priced
     from kerv_cli.report.tables import StudyData
 
@@ -59,16 +60,14 @@ def planned_study(resolved: ResolvedStudy, command: Sequence[str], is_rollout: b
         typer.echo(f"note: {override} has no effect: {reason}", err=True)
     # printed before torch and the simulator load
     typer.echo(f"{what} of {whose} on {where}: {count(number, 'episode')}", err=True)
-    from kerv_cli.episodes.resolve import unseen_tasks
     from kerv_cli.lab.database import opened
     from kerv_cli.lab.store import ROLLOUT, SWEEP
     from kerv_cli.lab.study import plan
     from kerv_cli.worlds import spec_of
 
     planned = plan(resolved, opened(resolved.first.results), command, ROLLOUT if is_rollout else SWEEP)
-    for target, names in dict.fromkeys((s.policy.target, tuple(unseen_tasks(s, tasks))) for s in settings.values()):
-        if names:
-            typer.echo(f"kerv: warning: policy {target} was never trained on {', '.join(names)}", err=True)
+    for target, names in resolved.unseen.items():
+        typer.echo(f"kerv: warning: policy {target} was never trained on {', '.join(names)}", err=True)
     for task in dict.fromkeys(one.task for one in planned.to_run):
         spec_of(task).check_installed(resolved.first.policy.target)
     if is_rollout and planned.existing:
@@ -102,7 +101,7 @@ def print_study_plan(planned: Study, as_json: bool, guess: float = SECONDS_PER_E
         as_json: Print the plan as JSON.
         guess: Seconds per episode if none was measured.
     """
-    from kerv_cli.lab.progress import TimeLeft
+    from kerv_cli.lab.study import TimeLeft
     from kerv_cli.lab.workers import disturbances
 
     rows, to_run, reused = _plan_rows(planned), planned.to_run, planned.existing
@@ -149,8 +148,7 @@ def run_study(planned: Study, guess: float = SECONDS_PER_EPISODE) -> Outcome:
         Interrupted: The user pressed Ctrl-C.
         KervError: The study could not run, see `study.run`.
     """
-    from kerv_cli.lab.progress import TimeLeft
-    from kerv_cli.lab.study import run
+    from kerv_cli.lab.study import TimeLeft, run
     from kerv_cli.report.viewing import save_recording
 
     with progress_bar("episodes", has_estimate=True) as show:
@@ -166,7 +164,7 @@ def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None =
         show: Moves the bar, see `progress_bar`.
         left: Estimates the time left. None: it is not shown.
     """
-    from kerv_cli.lab.progress import BlockStarted, BlocksWait, Preparing, SettingFailed, Started
+    from kerv_cli.lab.work import BlockStarted, BlocksWait, Preparing, SettingFailed, Started
 
     total = ended = 0
     title = "starting"

@@ -24,8 +24,8 @@ from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 
 if TYPE_CHECKING:
     from kerv_cli.episodes.resolve import ResolvedStudy
-    from kerv_cli.lab.progress import Outcome
     from kerv_cli.lab.store import Study
+    from kerv_cli.lab.study import Outcome
 
 
 @command(
@@ -106,13 +106,10 @@ def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, study: Study, as_j
     typer.echo(", ".join(f"{number} {what}" for what, number in counts.items()))
     if data is not None and not failed:
         from kerv_cli.report.report import write_study
-        from kerv_cli.report.reprice import own_prices
 
         # the study in the database may have more tasks, from earlier sweeps
         is_whole = study.counts()[1] == len(data.study.episodes)
-        data = data if is_whole else load_study(study)
-        priced = own_prices(data)
-        write_study(data, resolved.sweep.loss, priced)
-        print_prices(priced)
-        print_verdict(data, resolved.sweep.loss)
+        report = write_study(data if is_whole else load_study(study), resolved.sweep.loss)
+        print_prices(report.priced)
+        print_verdict(report.data, resolved.sweep.loss)
     raise typer.Exit(int(bool(failed)))

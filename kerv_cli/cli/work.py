@@ -22,14 +22,13 @@ def work(settings: WorkSettings) -> None:
     from kerv_cli.base.processes import end_with_input
     from kerv_cli.episodes.resolve import study_name
     from kerv_cli.lab.database import opened
-    from kerv_cli.lab.progress import EpisodeEnd, Event
     from kerv_cli.lab.store import Study
 
     if not settings.study:
         raise UsageError("of which study? name one, study=NAME: 'kerv runs list' shows them")
     if settings.run:
         end_with_input()
-    from kerv_cli.lab.study import work_on
+    from kerv_cli.lab.work import EpisodeEnd, Event, work_on
     from kerv_cli.report.viewing import save_recording
 
     ended = 0

@@ -1,4 +1,4 @@
-"""Runs one episode: a decoder acts in a world (an open environment)."""
+"""Runs one episode: a decoder acts in a world (an open environment), which may go on while it decodes."""
 
 from __future__ import annotations
 
@@ -6,21 +6,68 @@ import dataclasses
 import math
 import time
 from collections import deque
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import Any
 
 import numpy as np
 
-from kerv_cli.base.spaces import Observation
+from kerv_cli.base.errors import KervError
+from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.chunk import Follower
 from kerv_cli.engine.decoder import ActionDecoder
 from kerv_cli.engine.record import DecodeRecord, Delay, EpisodeRecord
-from kerv_cli.episodes.clock import RealClock
+from kerv_cli.episodes.settings import CHUNK
 from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import World
 
 AT_OBJECT = 0.05
 """Distance in metres. If the fingertips have been closer than this to the object, its later motion counts as theirs."""
+
+
+Latency = Callable[[DecodeRecord], float]
+"""Function that takes a decode's record and returns the seconds from its observation to its first action."""
+
+
+def steps_during(seconds: float, control_hz: float) -> int:
+    """Convert a latency to control steps, rounded up. Rounding errors just above a whole number are ignored.
+
+    Args:
+        seconds: The latency.
+        control_hz: Control steps per second.
+
+    Raises:
+        KervError: The latency is negative or not finite.
+    """
+    if not 0 <= seconds < math.inf:
+        raise KervError(f"the latency of a decode is {seconds} seconds, which cannot be")
+    return math.ceil(round(seconds * control_hz, 6))
+
+
+class RealClock:
+    """Tells an episode how long each decode takes, and which of its actions are too old by then.
+
+    Attributes:
+        expected: Number of control steps that the next decode will probably take: as many as the last decode took.
+    """
+
+    def __init__(self, latency: Latency, space: ActionSpace, compensation: str = "none") -> None:
+        self.latency, self.space, self.compensation = latency, space, compensation
+        self.expected = 0
+
+    def delay(self, decode: DecodeRecord, observed: int) -> Delay:
+        """Return how long a decode takes in control steps, and how many of its actions are then too old to execute.
+
+        Args:
+            decode: Record of the decode.
+            observed: Control step at which its observation was taken.
+
+        Raises:
+            KervError: The latency is negative or not finite.
+        """
+        seconds = self.latency(decode)
+        steps = self.expected = steps_during(seconds, self.space.control_hz)
+        stale = min(steps, len(decode.actions) - 1) if self.compensation == CHUNK else 0
+        return Delay(seconds, steps, observed, dropped=stale)
 
 
 def moved_after_approach(distances: Sequence[float], objects: Sequence[np.ndarray]) -> float:

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
+from operator import attrgetter
+from pathlib import Path
 
 import numpy as np
 import torch
 
-from kerv_cli.base.errors import KervError, UsageError
+from kerv_cli.base.errors import CheckpointError, KervError, UsageError
+from kerv_cli.base.files import sha256_of
+from kerv_cli.base.paths import results_dir
+from kerv_cli.base.registry import DRAFTING
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.spaces import Observation, ObservationSpace
+from kerv_cli.engine.cost import Profile, prices, read_profile, work_of_record
 from kerv_cli.engine.decoder import ActionDecoder, Decoder
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.engine.stopwatch import Stopwatch
-from kerv_cli.episodes import clock
-from kerv_cli.episodes.clock import RealClock
+from kerv_cli.episodes.episode import Latency, RealClock, steps_during
 from kerv_cli.episodes.identity import OBSERVATION
-from kerv_cli.episodes.resolve import tasks_of
-from kerv_cli.episodes.settings import WAITS, RolloutSettings
+from kerv_cli.episodes.settings import CHUNK, MEASURED, PROFILE, REAL, WAITS, RolloutSettings
 from kerv_cli.methods.artifacts import Artifacts, Use
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.settings import EXPERT, MethodSettings
-from kerv_cli.worlds import spec_of
+from kerv_cli.targets.checkpoint import TargetDescription
+from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.views import frame_shape
 
@@ -50,13 +55,13 @@ def check(settings: RolloutSettings) -> dict[str, str]:
             parts do not fit together.
         CheckpointError: The policy is missing or damaged, or a file belongs to another target or action space.
     """
-    tasks = tasks_of(settings)
+    tasks = resolve_tasks(settings.task)
     spec = spec_of(tasks[0])
     _check_seeds(settings, spec)
     spec.check_stress(settings.world.stress)
     if settings.policy.kind == EXPERT:
         _check_expert(settings)
-        clock.check(settings, spec, None)
+        _check_clock(settings, spec, None)
         experts = ";".join(f"{task} {spec.experts[task]}" for task in sorted(tasks) if task in spec.experts)
         return {"target": "", **({"expert": experts} if experts else {}), OBSERVATION: PRIVILEGED}
     artifacts = artifacts_of(settings)
@@ -68,7 +73,7 @@ def check(settings: RolloutSettings) -> dict[str, str]:
         if settings.rollout.batch > 1:
             raise UsageError(f"deviation_every={settings.deviation_every}: not in batches. Leave out rollout.batch")
     method.check(target, settings.rollout.batch)
-    profile = clock.check(settings, spec, target)
+    profile = _check_clock(settings, spec, target)
     world = dataclasses.asdict(settings.world)
     hashes = artifacts.check(method.needs, Use(method.settings, settings.runtime.dtype, spec.name, tasks, world))
     # stored with every episode, so that tables show which policies read the privileged state
@@ -99,6 +104,49 @@ def _check_expert(settings: RolloutSettings) -> None:
             raise UsageError(f"policy=expert with {word}: the expert decodes nothing, leave it out")
 
 
+def _check_clock(settings: RolloutSettings, spec: EnvironmentSpec, target: TargetDescription | None) -> dict[str, str]:
+    """Refuse settings of the clock that cannot work (docs/methods.md §8).
+
+    Args:
+        settings: The rollout's settings.
+        spec: The environment.
+        target: The policy's description; None for the expert.
+
+    Returns:
+        `{"profile": HASH}` with the SHA-256 of the profile that the rollout reads; empty if it reads none.
+
+    Raises:
+        UsageError: An episode would end before its first action, or all actions of a chunk are too old when they
+            arrive. Or the profile is missing, damaged, or lacks a phase that the method needs. Or the policy is the
+            expert, for which a profile has no latencies.
+    """
+    timing = settings.rollout
+    if timing.clock != REAL or timing.latency == MEASURED:
+        return {}
+    if timing.latency == PROFILE:
+        if target is None:
+            raise UsageError(
+                "policy=expert with rollout.latency=profile: it has no forwards; use rollout.latency=constant or "
+                "measured"
+            )
+        _profile_latency(settings, target)
+        return {"profile": sha256_of(_profile_path(settings))}
+    late = steps_during(timing.latency_ms / 1000.0, spec.actions.control_hz)
+    horizon = spec.control_steps(settings.world.horizon)
+    if late >= horizon:
+        raise UsageError(
+            f"rollout.latency_ms={timing.latency_ms:g}: {late} control steps, but an episode of {spec.name} has "
+            f"{horizon}"
+        )
+    steps = 1 if target is None else settings.chunk or target.chunk
+    if timing.delay_compensation == CHUNK and late >= steps:
+        raise UsageError(
+            f"rollout.latency_ms={timing.latency_ms:g} with rollout.delay_compensation=chunk: all {steps} control "
+            f"steps of a chunk are stale after {late}"
+        )
+    return {}
+
+
 def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
     """Return the decoder for one setting (a method with all its options) on one task, warmed up.
 
@@ -122,12 +170,59 @@ def method_decoder(settings: RolloutSettings, task: str = "") -> Decoder:
 
 
 def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:
-    """Return the clock of a world that goes on while the policy decodes. None if the world waits."""
-    if settings.rollout.clock == WAITS:
+    """Return the clock of a world that goes on while the policy decodes. None if the world waits.
+
+    `rollout.latency` chooses the source of a decode's latency: a constant, the measured time, or a profile. A profile
+    is a file of `kerv bench` with the seconds that each phase of a decode (encode, prefill, …) takes on some machine.
+
+    Raises:
+        UsageError: The profile is missing or damaged, or it lacks a phase that the method needs.
+    """
+    timing = settings.rollout
+    if timing.clock == WAITS:
         return None
-    target = None if settings.policy.kind == EXPERT else artifacts_of(settings).description
-    latency = clock.latency_of(settings, target)
-    return RealClock(latency, spec_of(task).actions, settings.rollout.delay_compensation)
+    if timing.latency == PROFILE:
+        latency = _profile_latency(settings, artifacts_of(settings).description)
+    else:
+        latency = attrgetter("seconds") if timing.latency == MEASURED else lambda decode: timing.latency_ms / 1000.0
+    return RealClock(latency, spec_of(task).actions, timing.delay_compensation)
+
+
+def _profile_latency(settings: RolloutSettings, target: TargetDescription) -> Latency:
+    """Return a function that computes the latency of a decode from the rollout's profile.
+
+    Raises:
+        UsageError: The profile is missing or damaged, or it lacks a phase that the method needs.
+    """
+    path, name = _profile_path(settings), settings.rollout.profile
+    try:
+        profile = read_profile(path)
+    except CheckpointError as error:
+        raise UsageError(f"rollout.profile={name}: {error}") from error
+    method = Method.of(settings)
+    costs = method.prefill_draft.cost, method.proposer.cost
+    drafter = (DRAFTING, "feed") if DRAFTING in costs else ()
+    if lacks := profile.lacks(("encode", "prefill", "verify", *drafter)):
+        raise UsageError(f"rollout.profile={name}: {path} has no phase '{lacks[0]}', which this method needs")
+    ar_seconds = settings.rollout.ar_ms / 1000.0
+    whole = profile.decode((settings.chunk or target.chunk) * target.actions.dofs)
+    if ar_seconds and not whole:
+        raise UsageError(f"rollout.profile={name}: its AR decode takes no time; leave out rollout.ar_ms")
+    return profiled(profile, ar_seconds / whole if ar_seconds else 1.0)
+
+
+def profiled(profile: Profile, scale: float = 1.0) -> Latency:
+    """Return a function that computes the latency of a decode from the costs in `profile`, multiplied by `scale`."""
+    return lambda decode: scale * float(prices(work_of_record(decode), profile)[0])
+
+
+def _profile_path(settings: RolloutSettings) -> Path:
+    """Return the path of `rollout.profile`, which is a file or a name in <results>/bench."""
+    name, results = settings.rollout.profile, settings.results
+    for path in (Path(name).expanduser(), results_dir(results) / "bench" / f"{name}.json"):
+        if path.is_file():
+            return path
+    raise UsageError(f"rollout.profile={name}: no such document, nor in {results}/bench: 'kerv bench' writes one")
 
 
 def still_observation(decoder: ActionDecoder, space: ObservationSpace, pixels: int) -> Observation:

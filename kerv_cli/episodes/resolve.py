@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -75,10 +76,20 @@ class ResolvedStudy:
         """The first setting. Used for values that all settings share, such as the results folder."""
         return next(iter(self.settings.values()))
 
-    @property
+    @functools.cached_property
     def tasks(self) -> tuple[str, ...]:
         """Full names of the tasks. They are the same for all settings."""
         return resolve_tasks(self.first.task)
+
+    @property
+    def unseen(self) -> dict[str, list[str]]:
+        """For each target that names its training tasks, those of the study's tasks that it was not trained on."""
+        found: dict[str, list[str]] = {}
+        for one in self.settings.values():
+            trained = () if one.policy.target in found else trained_tasks(one)
+            if unseen := [task for task in self.tasks if trained and task not in trained]:
+                found[one.policy.target] = unseen
+        return found
 
 
 def resolve(overrides: Sequence[str]) -> ResolvedStudy:
@@ -100,8 +111,7 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     study.name, typed = study.name or path.stem, set(map(_key, of_settings))
     with _line_of(path, typed, "common"):
         common = _outranked(split(study.common), of_settings)
-    points = _points(study, path)
-    _check_points(study, points, typed)
+    points = _points(study, path, typed)
     settings: dict[str, RolloutSettings] = {}
     for label, point in points.items():
         with _line_of(path, typed, f"settings.{point.name}", dict.fromkeys(map(_key, common), "common")):
@@ -115,8 +125,12 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     return ResolvedStudy(sweep, settings, points, tuple(of_settings))
 
 
-def _points(study: StudySettings, path: Path) -> dict[str, Point]:
-    """Expand every entry of the study's `settings` into the points of its grid. Return the points by label."""
+def _points(study: StudySettings, path: Path, typed: Collection[str]) -> dict[str, Point]:
+    """Expand every entry of the study's `settings` into the points of its grid. Return the points by label.
+
+    Raises:
+        UsageError: The study has no settings or lacks its baseline, or it sets a key of the command line (`typed`).
+    """
     points: dict[str, Point] = {}
     for name, text in study.settings.items():
         with _line_of(path, (), f"settings.{name}"):
@@ -125,11 +139,6 @@ def _points(study: StudySettings, path: Path) -> dict[str, Point]:
             for words in expand(overrides):
                 point = Point.of(name, words, varied)
                 points[point.label] = point
-    return points
-
-
-def _check_points(study: StudySettings, points: Mapping[str, Point], typed: Collection[str]) -> None:
-    """Refuse a study without settings or without its baseline, or one that sets keys of the command line (`typed`)."""
     if not points:
         raise UsageError(f"study '{study.name}' has no settings: see conf/study/demo.yaml for some")
     own = chain.from_iterable(point.overrides for point in points.values())
@@ -140,6 +149,7 @@ def _check_points(study: StudySettings, points: Mapping[str, Point], typed: Coll
             f"study '{study.name}' has no setting '{study.baseline}', the baseline that its others are "
             f"compared with: add it, or name one of these by baseline=: {', '.join(points)}"
         )
+    return points
 
 
 @contextmanager
@@ -159,17 +169,6 @@ def _line_of(path: Path, typed: Collection[str], place: str, others: Mapping[str
         if line is None or error.key in typed:
             raise
         raise UsageError(f"{path}:{line}: {error}", error.key) from error
-
-
-@contextmanager
-def _named(point: str) -> Iterator[None]:
-    """Add the point of a grid, such as `method=kerv`, to the message of a UsageError. Empty: there is one point."""
-    try:
-        yield
-    except UsageError as error:
-        if not point:
-            raise
-        raise UsageError(f"{point}: {error}", error.key) from error
 
 
 def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
@@ -193,11 +192,16 @@ def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
     settings: dict[str, RolloutSettings] = {}
     points: dict[str, Point] = {}
     for words in expand(others) if multirun else [others]:
-        with _named(" ".join(_parted(words, swept)[0])):
+        try:
             composed = compose("rollout", [*tasks, *words], RolloutSettings)
+        except UsageError as error:
+            if not swept:
+                raise
+            point, _ = _parted(words, swept)
+            raise UsageError(f"{' '.join(point)}: {error}", error.key) from error
         parts, _ = _parted(words, set(METHOD_KINDS) - varied)
-        point = Point.of(" ".join([composed.method, *parts]), words, varied)
-        settings[point.label], points[point.label] = composed, point
+        made = Point.of(" ".join([composed.method, *parts]), words, varied)
+        settings[made.label], points[made.label] = composed, made
     baseline = next((label for label, one in settings.items() if _is_ar(one)), next(iter(settings)))
     _settle(settings.values(), settings[baseline])
     study = StudySettings(name="rollout", title="", baseline=baseline, block=MOST_SEEDS)
@@ -275,12 +279,6 @@ def trained_tasks(settings: RolloutSettings) -> tuple[str, ...]:
 
     names = described(folder, "target", TargetDescription).tasks
     return resolve_tasks(names) if names else ()
-
-
-def unseen_tasks(settings: RolloutSettings, tasks: Iterable[str]) -> list[str]:
-    """Return the tasks that the target was not trained on. Empty if the target does not name its training tasks."""
-    trained = trained_tasks(settings)
-    return [task for task in tasks if trained and task not in trained]
 
 
 def study_name(study: str) -> str:

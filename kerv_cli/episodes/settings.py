@@ -14,6 +14,8 @@ from kerv_cli.worlds.settings import EVALUATION_SEED, RolloutWorldSettings
 
 WAITS, REAL = "waits", "real"
 MEASURED, CONSTANT, PROFILE = "measured", "constant", "profile"
+CHUNK = "chunk"
+"""Value of `rollout.delay_compensation`: do not execute actions of a new chunk that are already too old."""
 
 
 @dataclass
@@ -27,7 +29,7 @@ class TimingSettings:
     ar_ms: float = number(
         0.0, 0, 600_000, help="latency=profile: scale it so that an autoregressive decode takes this many ms; 0: do not"
     )
-    delay_compensation: str = choice("none", "none", "chunk", help="chunk: drop actions that come too late")
+    delay_compensation: str = choice("none", "none", CHUNK, help="chunk: drop actions that come too late")
     batch: int = number(1, 1, 1024, help="episodes that are decoded together; above 1, no times are measured")
 
     def check_together(self, prefix: str) -> None:

@@ -1,134 +1,55 @@
-"""Plans a study and runs it: `plan` finds the missing episodes, `run` runs them."""
+"""Plans a study and runs it: `plan` finds the missing episodes, `run` runs them and follows their progress."""
 
 from __future__ import annotations
 
 import contextlib
 import re
 import secrets
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
-from pathlib import Path
 
-from kerv_cli.base.errors import CheckpointError, Interrupted, KervError, StorageError, UsageError
+import sqlalchemy as sa
+
+from kerv_cli.base.errors import Interrupted, KervError, StorageError, UsageError
 from kerv_cli.base.paths import check_writable
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import RuntimeSettings
-from kerv_cli.engine.record import EpisodeRecord
-from kerv_cli.episodes.identity import OBSERVATION, without
+from kerv_cli.episodes.identity import without
 from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.resolve import ResolvedStudy
-from kerv_cli.episodes.runner import Request, Runner, close_worlds, is_recorded, run_batch
-from kerv_cli.episodes.settings import settings_from
-from kerv_cli.lab.database import Database
+from kerv_cli.episodes.runner import close_worlds
+from kerv_cli.lab.database import EPISODES, PLANNED, SETTINGS, STUDIES, WANTED, Database
 from kerv_cli.lab.plan import ALL, Episode, Setting, all_episodes
-from kerv_cli.lab.progress import Event, OnEvent, Outcome, Progress, SettingFailed
-from kerv_cli.lab.queue import Queue, enqueue
 from kerv_cli.lab.runs import Run, interrupted
 from kerv_cli.lab.store import ABOUT, ROLLOUT, SWEEP, Study
-from kerv_cli.lab.work import Prepare, work
-from kerv_cli.lab.workers import Array, LocalWorkers, follow, gpus_in_turn
+from kerv_cli.lab.work import (
+    BlockStarted,
+    EpisodeEnd,
+    EpisodeRunner,
+    Event,
+    OnEvent,
+    Prepare,
+    Queue,
+    Save,
+    SettingFailed,
+    Started,
+    enqueue,
+    load_per_core,
+    patiently,
+    work,
+)
+from kerv_cli.lab.workers import Array, LocalWorkers, gpus_in_turn
 
 SLURM = "slurm"
-Save = Callable[[EpisodeRecord, Path, str], object]
-"""Function that writes an episode to a .rrd file. The last argument is the setting's label."""
-
-
-@dataclass(frozen=True)
-class EpisodeRunner:
-    """Builds the decoder of a setting and runs its episodes.
-
-    Attributes:
-        rollouts: Folder for recordings, one .rrd file per recorded episode.
-        save: Writes the recording of an episode.
-    """
-
-    rollouts: Path
-    save: Save
-
-    def __call__(self, setting: Setting, task: str) -> Callable[[int], EpisodeRecord]:
-        """Build the setting's decoder for a task. Return a function that runs the episode with a given seed."""
-        runner = Runner(settings_from(setting.on(task)), task)
-
-        def run_episode(seed: int) -> EpisodeRecord:
-            record = runner.episode(seed, is_recorded(runner.settings, seed))
-            if record.frames:
-                self.save(record, self.rollouts / Episode(setting, record.task, seed).recording, setting.label)
-            return replace(record, frames={}, places={})
-
-        return run_episode
-
-    def together(self, episodes: Sequence[Episode]) -> Iterator[tuple[Episode, EpisodeRecord | Exception]]:
-        """Run episodes of one setting, `rollout.batch` at a time.
-
-        Yield each episode with its record, or with the error that its world raised.
-        """
-        setting = episodes[0].setting
-        settings = settings_from(setting.on(episodes[0].task))
-        requests = [Request(one, one.task, one.seed) for one in episodes]
-        for request, result in run_batch(settings, requests):
-            yield request.key, result
-
-
-def study_of(resolved: ResolvedStudy, database: Database, kind: str = SWEEP) -> Study:
-    """Check a study's settings, and return the study with all its episodes. `auto` devices are replaced by real ones.
-
-    Args:
-        resolved: The study with all its settings.
-        database: The database that has or gets the study's results.
-        kind: SWEEP or ROLLOUT.
-
-    Raises:
-        UsageError: A setting cannot run, or there are too many episodes.
-        CheckpointError: A setting's weights or data cannot be read.
-    """
-    about, settings = resolved.study, []
-    for label, one in resolved.settings.items():
-        point, identity = resolved.points[label], check(one)
-        one.runtime.device = _device_of(one.runtime)
-        plain = without(asdict(one), {"task"})
-        settings.append(Setting(label, " ".join(point.overrides), plain, identity, point.varies, point.name))
-    settings.sort(key=lambda setting: setting.label != about.baseline)
-    episodes = all_episodes(settings, resolved.tasks, about.block, about.repeats)
-    own = {name: getattr(about, name) for name in ABOUT}
-    return Study(database, about.name, kind, tuple(settings), episodes, **own)
-
-
-def _device_of(runtime: RuntimeSettings) -> str:
-    """Return the device on which episodes run. On a cluster it is that of the nodes: this machine may have no GPU."""
-    if runtime.executor != SLURM:
-        return set_up(runtime)[0]
-    on_node = "cuda" if runtime.executor_options.gpus else "cpu"
-    return on_node if runtime.device == "auto" else runtime.device
-
-
-def checked(setting: Setting, tasks: list[str], results: str) -> Setting:
-    """Check that the weights and data that a stored setting uses are still the same.
-
-    Args:
-        setting: The stored setting.
-        tasks: Names of the tasks on which it will run.
-        results: The results folder in which it will run.
-
-    Returns:
-        The setting, changed to run in `results`.
-
-    Raises:
-        CheckpointError: The weights or data of the setting have changed.
-    """
-    stored = {**setting.settings, "results": results}
-    identity = check(settings_from({**stored, "task": tasks}))
-    for kind in setting.identity.keys() | identity.keys():
-        before, now = setting.identity.get(kind, "none"), identity.get(kind, "none")
-        if kind != OBSERVATION and before != now:
-            raise CheckpointError(
-                f"the {kind} of {setting.label} has changed from {before[:12]} to {now[:12]}: it cannot run again"
-            )
-    return replace(setting, settings=stored, identity=identity)
+FOLLOW_SECONDS = 0.3
+"""Seconds between two looks at the database while other processes run the blocks."""
 
 
 def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], kind: str = SWEEP) -> Study:
-    """Find out which episodes of a sweep or a rollout are in the database, and which must run.
+    """Check the settings of a sweep or a rollout. Find out which episodes are in the database, and which must run.
 
     A rollout is a new one each time. But if the same command was interrupted before, the rest of its newest rollout is
     planned instead.
@@ -140,7 +61,7 @@ def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], ki
         kind: SWEEP or ROLLOUT.
 
     Raises:
-        UsageError: A setting cannot run.
+        UsageError: A setting cannot run, or there are too many episodes.
         CheckpointError: A setting's weights or data cannot be read.
         StorageError: The results folder is not writable.
     """
@@ -148,7 +69,16 @@ def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], ki
     if kind == SWEEP and runtime.detach and runtime.executor != SLURM:
         raise UsageError("runtime.detach=true is for clusters: add runtime.executor=slurm")
     check_writable(str(database.results))
-    study = study_of(resolved, database, kind)
+    about, settings = resolved.study, []
+    for label, one in resolved.settings.items():
+        point, identity = resolved.points[label], check(one)
+        one.runtime.device = _device_of(one.runtime)
+        plain = without(asdict(one), {"task"})
+        settings.append(Setting(label, " ".join(point.overrides), plain, identity, point.varies, point.name))
+    settings.sort(key=lambda setting: setting.label != about.baseline)
+    episodes = all_episodes(settings, resolved.tasks, about.block, about.repeats)
+    own = {name: getattr(about, name) for name in ABOUT}
+    study = Study(database, about.name, kind, tuple(settings), episodes, **own)
     if kind == ROLLOUT:
         rerun, runtime = ALL, replace(runtime, workers=1, executor="local")
     known = None if kind == ROLLOUT else study.name  # a new rollout has no name yet
@@ -160,11 +90,40 @@ def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], ki
     return study.plan(rerun, begun.started if begun else "", runtime, command)
 
 
+def _device_of(runtime: RuntimeSettings) -> str:
+    """Return the device on which episodes run. On a cluster it is that of the nodes: this machine may have no GPU."""
+    if runtime.executor != SLURM:
+        return set_up(runtime)[0]
+    on_node = "cuda" if runtime.executor_options.gpus else "cpu"
+    return on_node if runtime.device == "auto" else runtime.device
+
+
 def new_name(study: Study) -> str:
     """Return a name for a new rollout, with date, time and methods: `20260301-142530-ar-spec_vla`."""
     methods = "-".join(dict.fromkeys(str(setting.settings["method"]) for setting in study.settings))
     name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{re.sub(r'[^A-Za-z0-9_.-]', '_', methods)[:32]}"
     return f"{name}-{secrets.token_hex(2)}" if replace(study, name=name).exists else name
+
+
+@dataclass
+class Outcome:
+    """Result of `study.run`. Each episode of the study is in exactly one of the first three lists.
+
+    If workers of a cluster go on without this command (`detached`), the missing episodes are in none.
+
+    Attributes:
+        done: Episodes that this command planned and that were run.
+        reused: Episodes that were in the database already, or that another command planned and ran.
+        failed: Settings that failed, with their episodes.
+        seconds: Wall time.
+        detached: Says which workers of a cluster run the missing episodes. Empty: none do.
+    """
+
+    done: list[Episode] = field(default_factory=list)
+    reused: list[Episode] = field(default_factory=list)
+    failed: list[SettingFailed] = field(default_factory=list)
+    seconds: float = 0.0
+    detached: str = ""
 
 
 def run(study: Study, on_event: OnEvent = lambda event: None, *, save: Save = lambda *_: None) -> Outcome:
@@ -224,61 +183,24 @@ def run_blocks(study: Study, prepare: Prepare, record: Run, on_event: OnEvent) -
     threads = max((one.setting.settings["runtime"]["threads"] for one in study.to_run), default=1)
     try:
         if blocks and runtime.executor == SLURM:
-            _follow_cluster(Array(queue, runtime, threads), progress)
+            array = Array(queue, runtime, threads)
+            if runtime.detach:
+                raise Detached(f"job {array.id} of Slurm runs them, its logs are in {array.logs}")
+            with array:
+                follow(queue, progress, lambda: array.tend(len(progress.outcome.done) + len(progress.outcome.failed)))
         elif blocks and runtime.workers > 1:
             number = min(runtime.workers, len(blocks))
             with LocalWorkers(queue, number, threads, gpus_in_turn(study.device)) as workers:
                 follow(queue, progress, workers.tend)
         elif blocks:
             work(queue, prepare, progress.see)
-        outcome = progress.end()
-    except BaseException as error:
-        if not isinstance(error, Detached):
-            with contextlib.suppress(StorageError):
-                queue.withdraw()
+        return progress.end()
+    except Detached:
         raise
-    return outcome
-
-
-def _follow_cluster(array: Array, progress: Progress) -> None:
-    """Follow the workers of a cluster until they have run all blocks. If that is interrupted, cancel them.
-
-    Raises:
-        Detached: The command was asked not to follow them.
-    """
-    if array.runtime.detach:
-        raise Detached(f"job {array.id} of Slurm runs them, its logs are in {array.logs}")
-    try:
-        follow(array.queue, progress, lambda: array.tend(progress))
-    except KeyboardInterrupt:
-        with contextlib.suppress(KervError):
-            array.cancel()
+    except BaseException:
+        with contextlib.suppress(StorageError):
+            queue.withdraw()
         raise
-
-
-def work_on(study: Study, run_id: str, on_event: OnEvent, save: Save) -> None:
-    """Run blocks (groups of episodes) that a sweep of the study has queued, until none is left. For `kerv work`.
-
-    Args:
-        study: The study.
-        run_id: Only blocks of the command with this id. Empty: all.
-        on_event: Called with each event, to show progress.
-        save: Writes the recording (.rrd file) of an episode.
-
-    Raises:
-        UsageError: The study is not in the database, or its device is not on this machine.
-        CheckpointError: Weights or data in this results folder are not those with which the study was planned.
-        StorageError: The disk is full or not writable, or the database does not answer.
-    """
-    if not run_id:  # a sweep of this machine has checked its settings
-        study = study.load()
-        for setting in study.settings:
-            set_up(settings_from(setting.on(study.tasks[0])).runtime)
-            checked(setting, study.tasks, str(study.database.results))
-    try:
-        work(Queue(study, run_id), EpisodeRunner(study.rollouts, save), on_event)
-    finally:
-        close_worlds()
 
 
 def _kept(study: Study) -> str:
@@ -287,3 +209,146 @@ def _kept(study: Study) -> str:
         return "{} of {} episodes".format(*study.counts())
     except StorageError:
         return "all complete episodes"
+
+
+def follow(queue: Queue, progress: Progress, tend: Callable[[], None]) -> None:
+    """Wait until every block (group of episodes) of a queue has ended. Show the progress of the workers that run them.
+
+    Args:
+        queue: The blocks.
+        progress: Reads from the database what has ended.
+        tend: Replaces workers that have ended. It is called each time before the database is read.
+    """
+    shown: set[tuple[int, str]] = set()
+    while patiently(queue.left)[0]:
+        tend()
+        for position, worker in patiently(queue.claimed):
+            if (position, worker) not in shown:
+                shown.add((position, worker))
+                progress.on_event(BlockStarted(progress.study.blocks[position]))
+        patiently(progress.look)
+        time.sleep(FOLLOW_SECONDS)
+
+
+class Progress:
+    """Collects the outcome of a plan: from the events of a worker in this process, and from the database.
+
+    Args:
+        study: The study with its plan.
+        record: The database row of the command.
+        on_event: Called with each event, to show progress.
+    """
+
+    def __init__(self, study: Study, record: Run, on_event: OnEvent) -> None:
+        self.study, self.record, self.on_event = study, record, on_event
+        self.outcome = Outcome(reused=list(study.existing))
+        self._missing = {one.key: one for one in study.to_run}
+        self._newest, self._began = study.newest, time.perf_counter()
+        record.beat(0, len(self._missing))
+        is_timed = any(block.batch == 1 for block in study.blocks)
+        on_event(Started(len(self._missing), len(study.existing), load_per_core() if is_timed else 0.0))
+
+    def see(self, event: Event) -> None:
+        """Take an event of a worker in this process."""
+        if isinstance(event, EpisodeEnd):
+            one = self._missing.pop(event.episode.key, None)
+            if one is None:
+                return
+            event = replace(event, episode=one)
+            (self.outcome.reused if event.elsewhere else self.outcome.done).append(one)
+            self.record.beat(len(self.outcome.done))
+        elif isinstance(event, SettingFailed):
+            known = (self._missing.pop(one.key, one) for one in event.episodes)
+            event = replace(event, episodes=tuple(known))
+            self.outcome.failed.append(event)
+        elif isinstance(event, BlockStarted):
+            self.look()
+        self.on_event(event)
+
+    def look(self) -> None:
+        """Read from the database which episodes other processes have run, and which have failed."""
+        for ended in self._ended():
+            self.see(ended)
+        for failure in self._failed():
+            self.see(failure)
+
+    def _ended(self) -> list[EpisodeEnd]:
+        ended = []
+        for key, rows in self.study.stored(self._newest).items():
+            self._newest, row = max(self._newest, rows[-1].id), rows[0]
+            if one := self._missing.get(key):
+                ended.append(EpisodeEnd(one, row.success, row.seconds or 0.0, row.run != self.record.id))
+        return ended
+
+    def _failed(self) -> list[SettingFailed]:
+        columns = (SETTINGS.c.work, WANTED.c.task, WANTED.c.seed, WANTED.c.repeat, WANTED.c.error)
+        query = sa.select(*columns).select_from(PLANNED).order_by(WANTED.c.position)
+        query = query.where(STUDIES.c.name == self.study.name, WANTED.c.error.is_not(None))
+        failed: dict[tuple[str, str, str], dict[Episode, None]] = {}
+        with self.study.database.reading() as connection:
+            for *key, error in connection.execute(query):
+                if one := self._missing.get(tuple(key)):
+                    failed.setdefault((key[0], key[1], error), {})[one] = None
+        found = []
+        for (_, _, error), episodes in failed.items():
+            reason, _, trace = error.partition("\n")
+            found.append(SettingFailed(reason, trace, episodes=tuple(episodes)))
+        return found
+
+    def end(self) -> Outcome:
+        """Return the outcome, after all blocks have ended.
+
+        Raises:
+            KervError: The study was deleted.
+        """
+        self.look()
+        if self._missing:
+            if not self.study.exists:
+                name = self.study.name
+                raise KervError(f"study {name} was deleted while it ran: run the same command to start it again")
+            reason = "another command has planned the study anew, without it: run the same command again"
+            self.see(SettingFailed(reason, episodes=tuple(self._missing.values())))
+        self.outcome.seconds = time.perf_counter() - self._began
+        return self.outcome
+
+
+class TimeLeft:
+    """Estimates how long the missing episodes of a plan take, and corrects that with each episode that ends.
+
+    An episode is expected to take the mean time of its setting's episodes, or, if its setting has none, of all
+    episodes. The workers share the total equally.
+
+    Args:
+        study: The study with its plan.
+        guess: Seconds per episode while nothing is measured.
+    """
+
+    def __init__(self, study: Study, guess: float) -> None:
+        self.workers = max(1, min(study.runtime.workers, len(study.blocks)))
+        self._waiting = Counter(one.setting.work for one in study.to_run)
+        self._guess, works = guess, {setting.work for setting in study.settings}
+        query = sa.select(EPISODES.c.work, sa.func.avg(EPISODES.c.wall_seconds), sa.func.count(EPISODES.c.wall_seconds))
+        with study.database.reading() as connection:
+            rows = connection.execute(query.where(EPISODES.c.work.in_(works)).group_by(EPISODES.c.work)).all()
+        self._stored = {work: float(mean) for work, mean, _ in rows if mean is not None}
+        self._ended: Counter[str] = Counter()
+        self._measured: defaultdict[str, float] = defaultdict(float)  # seconds of those that ended, by setting
+        stored = sum(number for *_, number in rows)
+        self.source = f"measured on {stored} stored episodes" if stored else f"a guess of {guess:g} s per episode"
+
+    def see(self, event: Event) -> None:
+        """Take an event of the run: an episode that ended, or those that will not run."""
+        if isinstance(event, EpisodeEnd):
+            self._waiting[event.episode.setting.work] -= 1
+            if event.seconds:
+                self._ended[event.episode.setting.work] += 1
+                self._measured[event.episode.setting.work] += event.seconds
+        elif isinstance(event, SettingFailed):
+            self._waiting.subtract(one.setting.work for one in event.episodes)
+
+    @property
+    def seconds(self) -> float:
+        """Estimated seconds until every planned episode has ended or failed."""
+        means = self._stored | {work: self._measured[work] / number for work, number in self._ended.items()}
+        mean = sum(means.values()) / len(means) if means else self._guess
+        return sum(number * means.get(work, mean) for work, number in self._waiting.items()) / self.workers

@@ -8,7 +8,6 @@ the database must be on a server.
 from __future__ import annotations
 
 import contextlib
-import functools
 import hashlib
 import itertools
 import os
@@ -17,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -28,9 +27,8 @@ from kerv_cli.base.errors import KervError, StorageError, UsageError
 from kerv_cli.base.files import storage_errors, visible
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.lab.command import STORE
-from kerv_cli.lab.progress import BlockStarted, Progress
-from kerv_cli.lab.queue import Queue, patiently
 from kerv_cli.lab.store import Study
+from kerv_cli.lab.work import Queue, patiently
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 """Environment variables with the number of CPU threads of numerical libraries.
@@ -41,7 +39,6 @@ GPUS = "CUDA_VISIBLE_DEVICES"
 
 MOST_STILLBORN = 3
 """After this many workers in a row have died before they claimed a block, the sweep ends."""
-_POLL_SECONDS = 0.3
 _LOOK_SECONDS = 5.0
 """Seconds between two questions to Slurm."""
 
@@ -96,25 +93,6 @@ def disturbances(study: Study) -> list[str]:
     else:
         return []
     return [f"{runtime.workers} workers measure times and {shared} (docs/scale.md)"]
-
-
-def follow(queue: Queue, progress: Progress, tend: Callable[[], None]) -> None:
-    """Wait until every block (group of episodes) of a queue has ended. Show the progress of the workers that run them.
-
-    Args:
-        queue: The blocks.
-        progress: Reads from the database what has ended.
-        tend: Replaces workers that have ended. It is called each time before the database is read.
-    """
-    shown: set[tuple[int, str]] = set()
-    while patiently(queue.left)[0]:
-        tend()
-        for position, worker in patiently(queue.claimed):
-            if (position, worker) not in shown:
-                shown.add((position, worker))
-                progress.on_event(BlockStarted(progress.study.blocks[position]))
-        patiently(progress.look)
-        time.sleep(_POLL_SECONDS)
 
 
 @dataclass
@@ -186,7 +164,7 @@ class LocalWorkers:
             if code not in (130, 137) and code > 0:
                 line = worker.last_line().removeprefix("kerv: ")
                 raise KervError(f"a worker process ended: {line or f'exit code {code}'}")
-            had_claims = patiently(functools.partial(self.queue.lapse, worker.process.pid))
+            had_claims = patiently(self.queue.lapse, worker.process.pid)
             self._stillborn = 0 if had_claims else self._stillborn + 1
             if self._stillborn >= MOST_STILLBORN:
                 raise KervError(f"{self._stillborn} worker processes were killed before they ran a block: "
@@ -216,7 +194,7 @@ def _ask(program: str, *words: str, text: str = "", environment: dict[str, str] 
 
 
 class Array:
-    """The workers of a study on a cluster: an array of Slurm jobs.
+    """The workers of a study on a cluster: an array of Slurm jobs. Ctrl-C in its `with` statement cancels them.
 
     If an array that an earlier sweep of the study submitted still waits or runs, it is used. Otherwise a new one is
     submitted.
@@ -236,7 +214,15 @@ class Array:
         database = hashlib.sha256(queue.database.shown.encode()).hexdigest()[:8]
         self.name = f"kerv-{queue.study.name}-{database}"
         self.id = self._running() or self._submitted()
-        self._asked, self._done = time.monotonic(), -1
+        self._asked, self._ended = time.monotonic(), -1
+
+    def __enter__(self) -> Array:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
+        if kind is KeyboardInterrupt:
+            with contextlib.suppress(KervError):
+                _ask("scancel", self.id)
 
     def _running(self) -> str:
         """Return the id of the study's array that waits or runs. Empty if there is none."""
@@ -265,26 +251,25 @@ class Array:
         printed = _ask("sbatch", "--parsable", "--requeue", *flags, text=script, environment=environment)
         return printed.strip().partition(";")[0]
 
-    def tend(self, progress: Progress) -> None:
+    def tend(self, ended: int) -> None:
         """Submit another array if all jobs have ended, for example at their time limit, but some episodes are left.
+
+        Args:
+            ended: Number of episodes and settings that have ended or failed so far.
 
         Raises:
             KervError: The jobs have ended without a single episode.
         """
         if time.monotonic() - self._asked < _LOOK_SECONDS:
             return
-        self._asked, done = time.monotonic(), len(progress.outcome.done) + len(progress.outcome.failed)
+        self._asked = time.monotonic()
         if self._running() or not self.queue.left()[0]:
             return
-        if done <= self._done:
+        if ended <= self._ended:
             raise KervError(f"job {self.id} of Slurm has ended without an episode: {self._last_line()}")
-        self.id, self._done = self._submitted(), done
+        self.id, self._ended = self._submitted(), ended
 
     def _last_line(self) -> str:
         """Return the last line of the newest log, or where the logs are."""
         logs: list[Path] = sorted(visible(self.logs), key=lambda path: path.stat().st_mtime)
         return (logs and last_line(logs[-1].read_text(errors="replace"))) or f"see {self.logs}"
-
-    def cancel(self) -> None:
-        """Cancel all jobs of the array."""
-        _ask("scancel", self.id)

@@ -24,7 +24,7 @@ from kerv_cli.base.files import write_if_changed
 from kerv_cli.base.rows import distinct, values_of
 from kerv_cli.report.results import Result, averaged, frame_of, is_number
 from kerv_cli.report.summary import MAIN, summary_frame
-from kerv_cli.report.tables import NO_STRESS, is_stressed, latency_table
+from kerv_cli.report.tables import NO_STRESS, is_stressed
 from kerv_cli.report.tally import Tally
 
 INK, MUTED, BLUE, GREEN = "#1f2933", "#6b7785", "#0b6fb8", "#2a9d6f"
@@ -197,15 +197,22 @@ def lines_figure(measures: Iterable[pd.DataFrame], xlabel: str, ylabel: str | No
     return _chart(charts, _ACROSS)
 
 
-def latency_figure(results: Sequence[Result]) -> alt.ConcatChart:
+def latency_figure(results: Sequence[Result], latencies: pd.DataFrame) -> alt.ConcatChart:
     """Draw success against decoding latency, with one panel per kind of delay compensation.
 
     Only settings whose world goes on during a decode are drawn. The x axis has the latency of the AR baseline under the
     same clock. So methods that ran under the same clock have the same x.
+
+    Args:
+        results: The study's rows over all tasks.
+        latencies: The same study's `latency_table`.
     """
-    latencies = latency_table(results).set_index("label")["ar_latency_ms"]
     rows = _drawn(results)
-    rows = rows.assign(x=rows["label"].map(latencies)).query("x > 0").sort_values("x", kind="stable")
+    rows = (
+        rows.assign(x=rows["label"].map(latencies.set_index("label")["ar_latency_ms"]))
+        .query("x > 0")
+        .sort_values("x", kind="stable")
+    )
     panels = "delay compensation: " + rows["rollout.delay_compensation"]
     points = _points(rows.assign(line=rows["method"], panel=panels), SUCCESS)
     return lines_figure([points], "an autoregressive decode takes, ms", "success, %")

@@ -169,6 +169,11 @@ class StudyData:
         return with_matched_speed(_results(self, ONE_TASK))
 
     @functools.cached_property
+    def latencies(self) -> pd.DataFrame:
+        """The rows of settings whose world goes on during a decode (`latency_table`)."""
+        return latency_table(self.results)
+
+    @functools.cached_property
     def table(self) -> pd.DataFrame:
         """`results` as a data frame."""
         return frame_of(self.results)
@@ -220,13 +225,14 @@ def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyDa
 
     Args:
         study: The study, named or loaded.
-        wanted: Episodes to read. Settings without any of them are left out. None: read all episodes.
+        wanted: Episodes of a loaded study to read. Settings without any of them are left out. None: read all episodes.
 
     Raises:
         UsageError: There is no such study, or none of its episodes is stored.
     """
-    study = study.load()
-    if wanted is not None:
+    if wanted is None:
+        study = study.load()
+    else:
         labels = {one.setting.label for one in wanted}
         settings = tuple(setting for setting in study.settings if setting.label in labels)
         study = replace(study, settings=settings, episodes=tuple(wanted))
