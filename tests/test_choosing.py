@@ -12,12 +12,12 @@ from kerv_cli.report.results import MICRO, Measures, Result
 from kerv_cli.report.statistics import NO_ESTIMATE, Estimate, PairedCounts, paired_difference, pairs_to_settle, wilson
 from kerv_cli.report.verdict import (
     choices,
-    episodes_to_settle,
     order_of,
     pareto,
     safest_first,
     sentence,
     short_sentence,
+    verdict_of,
     with_matched_speed,
 )
 
@@ -126,8 +126,8 @@ def test_what_is_not_shown_yet_says_how_many_pairs_more_would_do(rows):
     said = sentence(found, 2.0, "ar")
     assert "the fastest setting that may keep the success is r=9: 1.50 (1.40–1.60 of this run) times as fast" in said
     assert said.endswith("more pairs would show it for r=9")
-    assert episodes_to_settle(rows, 2.0) == math.ceil(found.candidate_pairs)
-    assert episodes_to_settle(rows, 4.0) == 0, "a setting is named already"
+    assert verdict_of(rows, 2.0).episodes == math.ceil(found.candidate_pairs)
+    assert verdict_of(rows, 4.0).episodes == 0, "a setting is named already"
     slower = choices(only(rows, "ar", "slow"), [], 2.0)[0]
     assert sentence(slower, 2.0, "ar") == "no setting is shown to be faster per episode than ar (200 pairs)"
     far = replace(found, candidate_pairs=110_128.0)

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 from studies_synthetic import swept, threshold_study
 
-from kerv_cli.report.report import render
+from kerv_cli.report.report import Report, render
 from kerv_cli.report.tables import load_study
 from kerv_cli.report.viewing.film import Film
 
@@ -16,7 +16,7 @@ def page(browser, tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
     store, _ = swept(folder, threshold_study(["reach-v3", "push-v3"], axis="", note="Made up."))
     path = folder / "page.html"
-    path.write_text(render(load_study(store), 3.0), encoding="utf-8")
+    path.write_text(render(Report(load_study(store))), encoding="utf-8")
     page = browser.new_context(viewport={"width": 1300, "height": 900}, offline=True).new_page()
     errors: list[str] = []
     page.on("pageerror", lambda error: errors.append(str(error)))
@@ -79,7 +79,7 @@ def test_a_report_has_a_film_of_one_success_and_one_failure_per_method(tmp_path,
         "kerv_cli.report.report.film_of", lambda path: Film((buffer.getvalue(),), 80.0, {"steps": 4}, 0)
     )
     monkeypatch.setattr("kerv_cli.report.report.library", str)
-    page = render(data, 3.0)
+    page = render(Report(data))
     expected = data.episodes.groupby("label")["success"].nunique().sum()
     assert page.count("data:image/webp;base64,") == expected > 3
     assert page.count('class="lost"') == expected - 3

@@ -30,7 +30,7 @@ from kerv_cli.lab.store import Study
 from kerv_cli.lab.work import RunEpisode
 from kerv_cli.report.glossary import METHODS, UNVERIFIED, WORDS, explained
 from kerv_cli.report.plots import acceptance_figure, curves_figure, png, study_figures, with_lines
-from kerv_cli.report.report import Unpublishable, refusals, render, report
+from kerv_cli.report.report import Report, Unpublishable, refusals, render, report
 from kerv_cli.report.results import MACRO, MICRO, Result, averaged, columns_of, frame_of
 from kerv_cli.report.statistics import PairedCounts, mean_of, paired_difference, speedup, wilson
 from kerv_cli.report.summary import SummaryTable, not_in_turn, of_runs, summary_frame
@@ -414,7 +414,7 @@ def test_a_page_shows_hostile_names_as_text(tmp_path, monkeypatch):
     settings = {"ar": settings_of("ar"), name: settings_of("spec_vla", 9)}
     store, _ = swept(tmp_path, study_of(settings, ["reach-v3"], title=name))
     monkeypatch.setattr("kerv_cli.report.report.library", lambda: "")
-    page = render(load_study(store), 3.0)
+    page = render(Report(load_study(store)))
     assert "<img" not in page
     assert page.count("</script>") == page.count("<script") == 4
 

@@ -103,7 +103,7 @@ def test_the_report_writes_the_sums(stressed):
 
 
 def test_the_verdict_says_who_falls_behind_where(stressed_results):
-    behind, is_shown = verdict_of(stressed_results, 3.0)
+    behind, is_shown, _ = verdict_of(stressed_results, 3.0)
     assert "less successful than ar: bold, kind=light level=4. More successful: no setting" in behind
     assert not is_shown
     kept = [row for row in stressed_results if (row.stress, row.stress_level) != ("light", 4)]
@@ -186,7 +186,7 @@ def test_every_setting_is_compared_with_ar_at_its_latency(delayed):
     printed = summary_frame(whole).set_index("setting")
     assert printed.loc["spec_vla ar_ms=100 none"]["a decode takes, ms"] == "40.0"
     assert printed.loc["ar waits"]["a decode takes, ms"] == "–"
-    answer, _ = verdict_of(whole, 3.0)
+    answer = verdict_of(whole, 3.0).sentence
     assert "do not solve the tasks, nothing is compared: ar ar_ms=100 none" in answer
     assert latency_table(row for row in whole if row.label == "ar waits").empty
 

@@ -36,13 +36,14 @@ def _parts(database: Database, name: str, version: str, is_running: bool) -> tup
         version: `Study.version` of the study. A study is read again only if its version has changed.
         is_running: Whether it runs. If so, no cost model estimates its speeds, which would take time from it.
     """
-    from kerv_cli.report.report import study_parts  # imports Altair, which takes a second
+    from kerv_cli.report.report import Report, study_parts  # imports Altair, which takes a second
     from kerv_cli.report.reprice import own_profiles, prices_on
     from kerv_cli.report.tables import load_study
 
     began = time.thread_time()
     data = load_study(Study(database, name))
-    parts = study_parts(data, priced=[] if is_running else prices_on(data, own_profiles(data)))
+    priced = [] if is_running else prices_on(data, own_profiles(data))
+    parts = study_parts(Report(data, priced=priced))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return parts, max(_SECONDS, (time.thread_time() - began) / (_SHARE * cores))
 

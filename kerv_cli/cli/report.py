@@ -82,7 +82,7 @@ def report(
     for one in reports:
         if study is None:
             typer.echo(one.data.name)
-        print_verdict(one.data, settings.loss)
+        print_verdict(one)
 
 
 def _as_json(reports: list[Report]) -> dict[str, object]:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from kerv_cli.lab.store import Study
     from kerv_cli.lab.study import Outcome, TimeLeft
     from kerv_cli.lab.work import Event
+    from kerv_cli.report.report import Report
     from kerv_cli.report.reprice import Priced
     from kerv_cli.report.tables import StudyData
 
@@ -255,23 +256,18 @@ def print_prices(priced: Sequence[Priced]) -> None:
         print_table(summary.columns, summary.itertuples(index=False), ASSUMES)
 
 
-def print_verdict(data: StudyData, loss: float) -> None:
-    """Print the last lines about a study: the verdict, the page to open, the recording to watch, the board.
+def print_verdict(report: Report) -> None:
+    """Print the last lines about a study: the verdict, the page to open, the recording to watch, the board."""
+    from kerv_cli.report.verdict import caution, order_of
 
-    Args:
-        data: The study.
-        loss: Largest loss of success that is accepted, percentage points.
-    """
-    from kerv_cli.report.verdict import caution, episodes_to_settle, order_of, verdict_of
-
-    study = data.study
+    data, study = report.data, report.data.study
     if order := order_of(data.by_speed):
         typer.echo(f"by speed per episode: {order}")
     if note := caution(data.results):
         typer.echo(f"note: {note}")
-    typer.echo(f"verdict: {verdict_of(data.results, loss)[0]}")
-    if study.kind == "sweep" and (episodes := episodes_to_settle(data.results, loss)):
-        typer.echo(f"settle it: {study.sweep_command(f'episodes={episodes}')}")
+    typer.echo(f"verdict: {report.verdict.sentence}")
+    if command := report.command_to_settle:
+        typer.echo(f"settle it: {command}")
     typer.echo(f"page: {study.root / 'report.html'}")
     typer.echo(f"browse: kerv board{results_word(study.database.words)}")
     recordings = study.recordings

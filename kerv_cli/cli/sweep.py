@@ -57,7 +57,8 @@ def sweep(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_js
     if plan:
         print_study_plan(study, as_json, resolved.study.seconds)
         return
-    _print_outcome(run_study(study, resolved.study.seconds), resolved, study, as_json)
+    outcome = run_study(study, resolved.study.seconds)
+    _print_outcome(outcome, resolved, study, as_json)
 
 
 def _list_studies(as_json: bool) -> None:
@@ -111,5 +112,5 @@ def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, study: Study, as_j
         is_whole = study.counts()[1] == len(data.study.episodes)
         report = write_study(data if is_whole else load_study(study), resolved.sweep.loss)
         print_prices(report.priced)
-        print_verdict(report.data, resolved.sweep.loss)
+        print_verdict(report)
     raise typer.Exit(int(bool(failed)))

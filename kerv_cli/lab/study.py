@@ -17,7 +17,6 @@ from kerv_cli.base.errors import Interrupted, KervError, StorageError, UsageErro
 from kerv_cli.base.paths import check_writable
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import RuntimeSettings
-from kerv_cli.episodes.identity import without
 from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.resolve import ResolvedStudy
 from kerv_cli.episodes.runner import close_worlds
@@ -73,7 +72,8 @@ def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], ki
     for label, one in resolved.settings.items():
         point, identity = resolved.points[label], check(one)
         one.runtime.device = _device_of(one.runtime)
-        plain = without(asdict(one), {"task"})
+        plain = asdict(one)
+        del plain["task"]
         settings.append(Setting(label, " ".join(point.overrides), plain, identity, point.varies, point.name))
     settings.sort(key=lambda setting: setting.label != about.baseline)
     episodes = all_episodes(settings, resolved.tasks, about.block, about.repeats)

@@ -6,10 +6,11 @@ A page has a verdict, tables, charts and settings. templates/_study.html is its 
 from __future__ import annotations
 
 import base64
+import functools
 import os
 import shlex
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -40,7 +41,7 @@ from kerv_cli.report.tables import (
     split_values,
     summed_table,
 )
-from kerv_cli.report.verdict import caution, episodes_to_settle, order_of, question, verdict_of
+from kerv_cli.report.verdict import Verdict, caution, order_of, question, verdict_of
 from kerv_cli.report.viewing.film import animation, film_of
 
 LOSS = 3.0
@@ -69,17 +70,44 @@ def to_report(database: Database, study: str | None) -> list[Study]:
 
 @dataclass(frozen=True)
 class Report:
-    """What `write_study` wrote and computed about one study.
+    """A report on one study: what it says, and the files that have it. Charts and verdict are computed once.
 
     Attributes:
         data: The study with its tables.
+        loss: Largest loss of success, in points, that the verdict accepts.
         priced: The study's speeds on other machines. Empty: none were estimated.
-        files: Written files, in the order of writing, the page last.
+        files: Written files, in the order of writing, the page last. Empty: nothing was written.
     """
 
     data: StudyData
-    priced: list[Priced]
-    files: list[Path]
+    loss: float = LOSS
+    priced: Sequence[Priced] = ()
+    files: list[Path] = field(default_factory=list)
+
+    @functools.cached_property
+    def verdict(self) -> Verdict:
+        """The study's answer."""
+        return verdict_of(self.data.results, self.loss)
+
+    @property
+    def command_to_settle(self) -> str:
+        """The command with which the verdict would name a setting. Empty if more episodes would not help."""
+        study, episodes = self.data.study, self.verdict.episodes
+        return study.sweep_command(f"episodes={episodes}") if study.kind == SWEEP and episodes else ""
+
+    @functools.cached_property
+    def figures(self) -> dict[str, alt.ConcatChart]:
+        """The study's charts.
+
+        Each key is the suffix of a file name: `_latency` is the chart for `<study>_latency.png`.
+        """
+        data = self.data
+        figures = study_figures(data.results, data.study.axis, self.loss)
+        if len(data.latencies):
+            figures["_latency"] = latency_figure(data.results, data.latencies)
+        if data.tallies:
+            figures["_acceptance"] = acceptance_figure(data.tallies, data.references)
+        return figures
 
 
 def report(
@@ -144,20 +172,20 @@ def write_study(data: StudyData, loss: float, profiles: Sequence[NamedProfile] =
                 f"study {data.study.name} may not be published: {'; '.join(clauses)}. Commit, then run it on one "
                 f"machine: 'kerv sweep study={data.study.name} results=fresh'"
             )
-    results, name = data.study.database.results, data.name
-    folder, page = results if publish else results / "report", data.study.root / "report.html"
-    tables, document = [], folder / "tables" / f"{name}.json"
+    report, name = Report(data, loss, priced), data.name
+    folder = data.study.database.results if publish else data.study.database.results / "report"
     for suffix, table in tables_of(data, priced).items():
-        tables.append(folder / "tables" / f"{name}{suffix}.csv")
-        write_text(tables[-1], csv_text(table))
-    write_json(document, further_of(data))
-    pictures, title = [], data.study.title or data.study.name
-    figures = figures_of(data, loss)
-    for suffix, figure in figures.items():
-        pictures.append(folder / "plots" / f"{name}{suffix}.png")
-        write_bytes(pictures[-1], png(figure, title, about(data.results)))
-    write_text(page, render(data, loss, priced, tables, figures))
-    return Report(data, priced, [*tables, document, *pictures, page])
+        report.files.append(folder / "tables" / f"{name}{suffix}.csv")
+        write_text(report.files[-1], csv_text(table))
+    report.files.append(folder / "tables" / f"{name}.json")
+    write_json(report.files[-1], further_of(data))
+    for suffix, figure in report.figures.items():
+        report.files.append(folder / "plots" / f"{name}{suffix}.png")
+        write_bytes(report.files[-1], png(figure, data.study.title or data.study.name, about(data.results)))
+    page = render(report)
+    report.files.append(data.study.root / "report.html")
+    write_text(report.files[-1], page)
+    return report
 
 
 def tables_of(data: StudyData, priced: Sequence[Priced]) -> dict[str, pd.DataFrame]:
@@ -203,56 +231,31 @@ def refusals(results: Sequence[Result]) -> list[str]:
     return clauses
 
 
-def render(
-    data: StudyData,
-    loss: float,
-    priced: Sequence[Priced] = (),
-    tables: Sequence[Path] = (),
-    figures: Mapping[str, alt.ConcatChart] | None = None,
-) -> str:
-    """Return the study's page as one HTML file that needs no other file and no network.
-
-    `study_parts` explains the arguments.
-    """
+def render(report: Report) -> str:
+    """Return the study's page as one HTML file that needs no other file and no network."""
     loader = PackageLoader("kerv_cli.report", "templates")
     templates = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
     templates.filters["code"] = with_code
     template = templates.get_template("study.html")
-    values = study_parts(data, loss, priced, tables, figures) | {"films": _films(data)}
+    values = study_parts(report) | {"films": _films(report.data)}
     return template.render(**values, library=library())
 
 
-def study_parts(
-    data: StudyData,
-    loss: float = LOSS,
-    priced: Sequence[Priced] = (),
-    tables: Sequence[Path] = (),
-    figures: Mapping[str, alt.ConcatChart] | None = None,
-) -> dict[str, Any]:
-    """Return the values that the template _study.html shows.
-
-    Args:
-        data: The study's episodes and tables.
-        loss: Largest loss of success, in points, that the verdict accepts.
-        priced: The study's speeds on other machines, from `repriced`.
-        tables: CSV files of the study, which are linked.
-        figures: The study's charts, from `figures_of`. None: they are drawn.
-    """
+def study_parts(report: Report) -> dict[str, Any]:
+    """Return the values that the template _study.html shows."""
+    data, verdict = report.data, report.verdict
     study, rows = data.study, data.results
-    answer, is_shown = verdict_of(rows, loss)
-    more = episodes_to_settle(rows, loss)
     first, results = rows[0].provenance, str(study.database.results)
-    figures = figures_of(data, loss) if figures is None else figures
     return {
         "name": study.name,
         "title": data.study.title or study.name,
         "note": data.study.note,
         "about": f"{about(rows)} · kerv {first['kerv_version']} at {first['git_commit'][:12]}",
-        "question": question(rows, loss),
-        "verdict": answer[:1].upper() + answer[1:],
-        "is_shown": is_shown,
+        "question": question(rows, report.loss),
+        "verdict": verdict.sentence[:1].upper() + verdict.sentence[1:],
+        "is_shown": verdict.is_shown,
         "order": order_of(data.by_speed),
-        "settles": study.sweep_command(f"episodes={more}") if more and study.kind == SWEEP else "",
+        "settles": report.command_to_settle,
         "caution": caution(rows),
         "wanted": len(data.study.episodes),
         "missing": len(data.absent),
@@ -263,32 +266,18 @@ def study_parts(
         "explained": explanations((row.label, row.method) for row in rows),
         "columns": f"{NOTE} {of_runs(rows)}",
         "suite": _suite(rows),
-        "charts": [figure.to_dict() for figure in figures.values()],
-        "has_bounds": "_tradeoff" in figures,
-        "has_acceptance": "_acceptance" in figures,
+        "charts": [figure.to_dict() for figure in report.figures.values()],
+        "has_bounds": "_tradeoff" in report.figures,
+        "has_acceptance": "_acceptance" in report.figures,
         "tasks": _by_task(data.task_results),
         "episodes": "",  # the board gives the address of the page of episodes
-        "machines": repriced_summary(priced) if priced else None,
+        "machines": repriced_summary(report.priced) if report.priced else None,
         "assumes": ASSUMES,
         "settings": _settings(data),
         "films": [],
         "recordings": [(path.stem, _href(path, study.root)) for path in study.recordings],
-        "files": [(path.name, _href(path, study.root)) for path in tables],
+        "files": [(path.name, _href(path, study.root)) for path in report.files if path.suffix == ".csv"],
     }
-
-
-def figures_of(data: StudyData, loss: float) -> dict[str, alt.ConcatChart]:
-    """Return the study's charts.
-
-    Each key is the suffix of a file name: `_latency` is the chart for `<study>_latency.png`. `loss` is the largest
-    acceptable loss of success, in points.
-    """
-    figures = study_figures(data.results, data.study.axis, loss)
-    if len(data.latencies):
-        figures["_latency"] = latency_figure(data.results, data.latencies)
-    if data.tallies:
-        figures["_acceptance"] = acceptance_figure(data.tallies, data.references)
-    return figures
 
 
 def _suite(results: Sequence[Result]) -> pd.DataFrame:

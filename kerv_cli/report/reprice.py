@@ -67,12 +67,13 @@ def prices_table(priced: Iterable[Priced]) -> pd.DataFrame:
     return pd.DataFrame(values_of(priced, "columns"))
 
 
-def repriced(data: StudyData, profiles: Sequence[NamedProfile]) -> list[Priced]:
+def repriced(data: StudyData, profiles: Sequence[NamedProfile], lenient: bool = False) -> list[Priced]:
     """Estimate how fast every setting would be on the machine of each profile.
 
     Args:
         data: The study's episodes.
         profiles: For each machine, the seconds that each operation of a decode takes there (`kerv bench`).
+        lenient: Leave out a profile that lacks a cost, instead of refusing it.
 
     Returns:
         One row per profile and setting. Settings that run no decoder are left out.
@@ -81,14 +82,21 @@ def repriced(data: StudyData, profiles: Sequence[NamedProfile]) -> list[Priced]:
         UsageError: A profile lacks a cost that the study needs, or has costs for shorter chunks only. Or a setting has
             no times, because its episodes ran in a batch.
     """
+    if not profiles:
+        return []
     decoded = data.episodes.groupby("label")[["forwards", "skipped_decodes"]].sum().any(axis=1)
     works = {label: _work_of_label(data, label) for label in data.labels if decoded[label]}
     if not works:
         return []
     rows = []
     for named in profiles:
-        for label, work in works.items():
-            named.check(work.size, work.work.needs, label)
+        try:
+            for label, work in works.items():
+                named.check(work.size, work.work.needs, label)
+        except UsageError:
+            if lenient:
+                continue
+            raise
         estimated = _estimated(data, works, named.profile)
         encoders = {name: _estimated(data, works, profile) for name, profile in named.encoders.items()}
         for result in averaged(data.results):
@@ -120,11 +128,13 @@ def prices_on(data: StudyData, names: Iterable[str]) -> list[Priced]:
         data: The study's episodes.
         names: Names of cost profiles. A profile that is missing or lacks a cost is left out.
     """
-    rows = []
+    profiles = []
     for name in names:
         with suppress(UsageError):
-            rows += repriced(data, open_profiles(data.study.database.results, [name]))
-    return rows
+            profiles += open_profiles(data.study.database.results, [name])
+    with suppress(UsageError):
+        return repriced(data, profiles, lenient=True)
+    return []
 
 
 def own_profiles(data: StudyData) -> list[str]:

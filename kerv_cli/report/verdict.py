@@ -15,6 +15,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
+from typing import NamedTuple
 
 from kerv_cli.base.durations import count
 from kerv_cli.base.rows import distinct, values_of
@@ -227,24 +228,37 @@ def with_matched_speed(rows: Sequence[Result]) -> list[Result]:
     return matched
 
 
-def verdict_of(results: Sequence[Result], loss: float) -> tuple[str, bool]:
-    """Return a study's answer as a sentence for the report.
+class Verdict(NamedTuple):
+    """A study's answer.
+
+    Attributes:
+        sentence: The answer as a sentence for the report.
+        is_shown: Whether a setting is shown both to be faster and to lose less success than is accepted.
+        episodes: About how many episodes per task would let the sentence name a setting. 0 if it names one already, or
+            if more episodes would not help.
+    """
+
+    sentence: str
+    is_shown: bool = False
+    episodes: int = 0
+
+
+def verdict_of(results: Sequence[Result], loss: float) -> Verdict:
+    """Return a study's answer.
 
     Args:
         results: The study's rows over all tasks.
         loss: Largest acceptable loss of success against the baseline, in points (percentage points).
-
-    Returns:
-        The sentence, and whether a setting is shown both to be faster and to lose less than `loss`.
     """
     rows = averaged(results)
     if not any(values_of(rows, "is_compared")):
         rates = ", ".join(f"{row.label} {POINTS * row.measures.success.value:.1f} %" for row in rows)
-        return f"success: {rates}.", False
+        return Verdict(f"success: {rates}.")
     if len(distinct(rows, "baseline")) > 1:
-        return f"{under_conditions(rows)}.", False
+        return Verdict(f"{under_conditions(rows)}.")
     found = choose("all tasks", rows, loss)
-    return f"{sentence(found, loss, rows[0].baseline)}.", found.is_shown
+    episodes = math.ceil(found.candidate_pairs / rows[0].tasks) if found.candidate_pairs <= stats.MOST_PAIRS else 0
+    return Verdict(f"{sentence(found, loss, rows[0].baseline)}.", found.is_shown, episodes)
 
 
 def question(results: Sequence[Result], loss: float) -> str:
@@ -296,22 +310,6 @@ def order_of(by_speed: Sequence[tuple[str, stats.Estimate]]) -> str:
         text += f"{label} {'>' if speed.low > 1 else '≈'} "
     apart = " (≈: these episodes cannot tell the two apart)" if "≈" in text else ""
     return f"{text}{by_speed[-1][0]}{apart}" if by_speed else ""
-
-
-def episodes_to_settle(results: Sequence[Result], loss: float) -> int:
-    """Return about how many episodes per task would let the verdict name a setting.
-
-    0 if it names one already, or if more episodes would not help.
-
-    Args:
-        results: The study's rows over all tasks.
-        loss: Largest acceptable loss of success, in points.
-    """
-    rows = averaged(results)
-    if len(distinct(rows, "baseline")) > 1:
-        return 0
-    pairs = choose("all tasks", rows, loss).candidate_pairs
-    return math.ceil(pairs / rows[0].tasks) if pairs <= stats.MOST_PAIRS else 0
 
 
 def unsolved(baseline: str, success: float) -> str:
