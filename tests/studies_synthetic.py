@@ -19,10 +19,10 @@ import pytest
 from kerv_cli.base.registry import find
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
-from kerv_cli.episodes.identity import without
+from kerv_cli.episodes.identity import Setting, without
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database, opened
-from kerv_cli.lab.plan import Setting, all_episodes
+from kerv_cli.lab.plan import all_episodes
 from kerv_cli.lab.runs import Run
 from kerv_cli.lab.store import Study
 from kerv_cli.lab.study import Outcome, run_blocks

@@ -26,8 +26,9 @@ from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.record import UNTIMED, EpisodeRecord
 from kerv_cli.episodes import runner as run
+from kerv_cli.episodes.identity import Setting
 from kerv_cli.episodes.runner import Request, run_together
-from kerv_cli.lab.plan import Episode, Setting, blocks_of
+from kerv_cli.lab.plan import Episode, blocks_of
 from kerv_cli.lab.store import Study
 from kerv_cli.lab.work import EpisodeRunner, RunEpisode
 from kerv_cli.methods.early import EarlySettings

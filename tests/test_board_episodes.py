@@ -32,7 +32,6 @@ from kerv_cli.catalogue.episodes import find_episode
 from kerv_cli.engine.record import Delay
 from kerv_cli.episodes.rows import decode_records, decodes_table
 from kerv_cli.episodes.runner import Runner, close_worlds
-from kerv_cli.episodes.settings import settings_from
 from kerv_cli.lab.database import WANTED, Database, opened
 from kerv_cli.lab.store import studies
 from kerv_cli.report.viewing.token_outcomes import outcomes_of, tokens_hash
@@ -142,7 +141,7 @@ def test_a_recording_that_is_a_link_out_of_the_results_folder_is_refused(tmp_pat
 
 def test_decodes_that_are_read_back_are_those_that_were_written(rolled):
     found = find_episode(rolled, rows_of_wanted(rolled)[1])
-    real = Runner(settings_from(found.episode.setting.on("reach-v3")), "reach-v3").episode(100_000)
+    real = Runner(found.episode.setting.on("reach-v3"), "reach-v3").episode(100_000)
     close_worlds()
     assert any(decode.filled for decode in real.decodes)
     made_up = rerun_synthetic.episode("mixed")

@@ -14,11 +14,11 @@ from kerv_cli.base.config import compose, conf_dir, groups
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.runtime import set_up
-from kerv_cli.base.settings import RuntimeSettings
+from kerv_cli.base.settings import RuntimeSettings, read_settings
 from kerv_cli.episodes.identity import effective, idle_keys, without_effect
 from kerv_cli.episodes.policy import check as check_rollout
 from kerv_cli.episodes.resolve import Point, ResolvedStudy, idle_overrides
-from kerv_cli.episodes.settings import RolloutSettings, SweepSettings, settings_from
+from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 from kerv_cli.methods import heisd
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.eagle import DrafterProposerSettings
@@ -86,8 +86,8 @@ def test_a_preset_is_the_parts_that_its_name_promises(method):
 def test_settings_survive_a_file(method):
     asked = composed(f"method={method}", "threshold=change", "policy.artifacts={own: mine}")
     plain = dataclasses.asdict(asked)
-    assert settings_from(plain) == asked
-    again = settings_from(json.loads(json.dumps(plain)))
+    assert read_settings(RolloutSettings, plain) == asked
+    again = read_settings(RolloutSettings, json.loads(json.dumps(plain)))
     assert again == asked
     for kind, part in asked.parts().items():
         assert type(getattr(again, kind)) is type(part)

@@ -16,12 +16,13 @@ from test_calibration import write_dataset
 from test_decoding_lossless import assert_adds_up, plain_greedy, random_prompt, random_target
 
 from kerv_cli.base.config import compose
+from kerv_cli.base.settings import read_settings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.catalogue.entries import find_runs, matching
 from kerv_cli.engine.chunk import ActionHistory, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.episodes.policy import check
-from kerv_cli.episodes.settings import RolloutSettings, settings_from
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import opened
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.compose import Method
@@ -94,7 +95,7 @@ def test_it_is_trained_from_the_command_line_and_drafts_in_every_place(results):
         identity = check(asked)
         assert set(identity) - {"observation"} == {"target", *wanted}
         assert identity["follow"] == described["sha256"]
-        assert settings_from(dataclasses.asdict(asked)) == asked
+        assert read_settings(RolloutSettings, dataclasses.asdict(asked)) == asked
         assert files.load("follow") is Artifacts(asked.results, asked.policy).load("follow")
         assert not torch.equal(files.load("follow").logits, FollowTable(4, 255).logits)
         plain, drafting = Decoder(files.target), method.decoder(files.target, files.load)

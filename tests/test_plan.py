@@ -16,9 +16,9 @@ import kerv_cli
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UsageError
 from kerv_cli.episodes import identity
-from kerv_cli.episodes.identity import ENGINE, _meaning, code_hash, hash_of, without, work_of
+from kerv_cli.episodes.identity import ENGINE, Setting, _meaning, code_hash, hash_of, without, work_of
 from kerv_cli.episodes.settings import RolloutSettings
-from kerv_cli.lab.plan import Block, Setting, all_episodes, blocks_of
+from kerv_cli.lab.plan import Block, all_episodes, blocks_of
 from kerv_cli.lab.runs import interrupted
 from kerv_cli.lab.store import Study
 from kerv_cli.report.summary import not_in_turn
@@ -241,7 +241,7 @@ def test_other_code_runs_again_on_request_only(database, monkeypatch):
     study = threshold_study(["reach-v3"])
     swept(database.results, study)
     assert not plan_study(database, study, "changed").missing
-    monkeypatch.setattr("kerv_cli.episodes.identity.code_hash", lambda: "f" * 64)
+    monkeypatch.setattr("kerv_cli.lab.plan.code_hash", lambda: "f" * 64)
     assert not plan_study(database, study).missing
     assert why(plan_study(database, study, "changed")) == {"other code"}
 
@@ -295,7 +295,7 @@ def test_reasons_name_what_changed(database, monkeypatch):
     idle.policy.artifacts["datastore"] = "mine"  # not read
     assert reason(idle) == ""
     monkeypatch.setattr(identity.work_of, "__defaults__", (4,))
-    monkeypatch.setattr("kerv_cli.lab.plan.ENGINE", 4)
+    monkeypatch.setattr("kerv_cli.episodes.identity.ENGINE", 4)
     assert reason(same) == f"engine {ENGINE} → 4"
 
 

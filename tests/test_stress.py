@@ -21,10 +21,11 @@ from hypothesis import strategies as st
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.registry import parts
+from kerv_cli.base.settings import read_settings
 from kerv_cli.episodes.identity import stress_of, work_of
 from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.runner import Runner, close_worlds
-from kerv_cli.episodes.settings import RolloutSettings, settings_from
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.demos.dataset import register_recorded
 from kerv_cli.worlds.demos.recording import DemoConfig, record
@@ -230,7 +231,7 @@ def test_a_stress_of_level_0_is_no_stress():
     now, zero = dataclasses.asdict(settings()), dataclasses.asdict(settings("world.stress.kind=light"))
     two = dataclasses.asdict(settings("world.stress.kind=light", "world.stress.level=2"))
     assert whole(now) == whole(zero) != whole(two)
-    assert settings_from(two).world.stress == StressSettings("light", 2)
+    assert read_settings(RolloutSettings, two).world.stress == StressSettings("light", 2)
     assert [stress_of(plain)["kind"] for plain in (now, zero, two)] == ["none", "none", "light"]
 
 

@@ -22,10 +22,11 @@ from studies_synthetic import part, plan_study, points_of, settings_of, still_ep
 
 from kerv_cli.base.config import groups
 from kerv_cli.engine.record import DecodeRecord, Round
+from kerv_cli.episodes.identity import Setting
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab import database as tables
 from kerv_cli.lab.database import opened
-from kerv_cli.lab.plan import Episode, Setting
+from kerv_cli.lab.plan import Episode
 from kerv_cli.lab.store import Study
 from kerv_cli.lab.work import RunEpisode
 from kerv_cli.report.glossary import METHODS, UNVERIFIED, WORDS, explained

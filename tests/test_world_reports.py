@@ -8,11 +8,10 @@ from studies_synthetic import episode, points_of, settings_of, study_of, swept
 
 from kerv_cli.base.config import compose
 from kerv_cli.engine.record import Delay
-from kerv_cli.episodes.identity import stress_of
+from kerv_cli.episodes.identity import Setting, stress_of
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings, SweepSettings, TimingSettings
 from kerv_cli.lab.database import opened
-from kerv_cli.lab.plan import Setting
 from kerv_cli.lab.work import RunEpisode
 from kerv_cli.report.plots import latency_figure, study_figures
 from kerv_cli.report.report import report

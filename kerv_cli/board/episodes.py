@@ -16,8 +16,7 @@ from kerv_cli.base.rows import distinct, values_of
 from kerv_cli.board import episode
 from kerv_cli.board.pages import database_of, render
 from kerv_cli.catalogue.episodes import outcomes, settings_in
-from kerv_cli.episodes.identity import stress_of
-from kerv_cli.lab.plan import Setting
+from kerv_cli.episodes.identity import Setting, stress_of
 from kerv_cli.lab.store import Study
 from kerv_cli.report.measures import NEAR
 from kerv_cli.report.tables import references_of

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from kerv_cli.base.processes import Workers
 from kerv_cli.catalogue.episodes import FoundEpisode
-from kerv_cli.lab.plan import Setting
+from kerv_cli.episodes.identity import Setting
 
 IDLE_SECONDS = 60
 """Seconds without work after which the recording process ends, to free its memory."""
@@ -106,12 +106,11 @@ def record_episode(setting: Setting, task: str, seeds: list[int], results: str, 
         The error in one line. Empty if all went well.
     """
     from kerv_cli.episodes.runner import Runner
-    from kerv_cli.episodes.settings import settings_from
     from kerv_cli.lab.work import checked, failure_of
     from kerv_cli.report.viewing import save_recording
 
     try:
-        runner = Runner(settings_from(checked(setting, [task], results).on(task)), task)
+        runner = Runner(checked(setting, [task], results).on(task), task)
         for seed in seeds[:-1]:
             runner.episode(seed)
         save_recording(runner.episode(seeds[-1], recorded=True), path, setting.label)

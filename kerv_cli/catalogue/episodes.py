@@ -12,8 +12,9 @@ import sqlalchemy as sa
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.rows import keyed
 from kerv_cli.engine.record import DecodeRecord
+from kerv_cli.episodes.identity import Setting
 from kerv_cli.lab.database import BLOCKS, EPISODES, SETTINGS, STUDIES, WANTED, Database, measures_in
-from kerv_cli.lab.plan import Episode, Setting
+from kerv_cli.lab.plan import Episode
 from kerv_cli.lab.store import Study, setting_of
 
 LARGEST_ID = 2**31 - 1

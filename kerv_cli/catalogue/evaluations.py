@@ -25,13 +25,14 @@ import pyarrow as pa
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import atomic_path
+from kerv_cli.base.settings import read_settings
 from kerv_cli.catalogue.imports import connect_foreign
 from kerv_cli.engine.record import EpisodeRecord
-from kerv_cli.episodes.identity import ENGINE, OBSERVATION, flat
+from kerv_cli.episodes.identity import ENGINE, OBSERVATION, Setting, flat
 from kerv_cli.episodes.rows import DECODE_SCHEMA, EPISODE_SCHEMA, INT, decodes_table, episode_row
-from kerv_cli.episodes.settings import RolloutSettings, settings_from
+from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database
-from kerv_cli.lab.plan import Episode, Setting
+from kerv_cli.lab.plan import Episode
 from kerv_cli.lab.store import IMPORT, ImportedEpisode, Study
 
 HARNESS = "vla-eval"
@@ -308,7 +309,7 @@ def _settings(first: Evaluation) -> dict[str, Any]:
     if isinstance(stored, dict):
         plain |= stored
         with contextlib.suppress(KervError):  # a part that is not registered here
-            plain = dataclasses.asdict(settings_from(stored))
+            plain = dataclasses.asdict(read_settings(RolloutSettings, stored))
     if str(first.config.get("benchmark", "")).startswith("kerv_cli."):
         params, world = dict(first.config.get("params") or {}), plain["world"]
         world["horizon"] = params.get("horizon", world["horizon"])

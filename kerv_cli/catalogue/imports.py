@@ -16,10 +16,11 @@ import sqlalchemy as sa
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import regular, write_folder
+from kerv_cli.episodes.identity import Setting
 from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.lab import database as tables
 from kerv_cli.lab.database import FILE, MEASURES, SCHEMA, Database, file_url, measures_in, newer
-from kerv_cli.lab.plan import Episode, Setting
+from kerv_cli.lab.plan import Episode
 from kerv_cli.lab.store import ImportedEpisode, Study, stored_settings
 from kerv_cli.worlds.demos.files import foreign_table
 

@@ -12,7 +12,7 @@ import hashlib
 import importlib.util
 import json
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,8 @@ import kerv_cli
 from kerv_cli.base import registry
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.registry import METHOD_KINDS, PART_GROUPS, AcceptancePart, ArtifactPart
-from kerv_cli.episodes.settings import CONSTANT, PROFILE, WAITS, RolloutSettings, TimingSettings, settings_from
+from kerv_cli.base.settings import read_settings
+from kerv_cli.episodes.settings import CONSTANT, PROFILE, WAITS, RolloutSettings, TimingSettings
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.settings import EXPERT
 
@@ -43,6 +44,82 @@ NOT_DETERMINING = frozenset(
     {"task", "episodes", "seed", "policy", "method", "results", "store", "record", "record_size"}
 )
 NOT_DETERMINING_RUNTIME = frozenset({"workers", "executor", "executor_options", "detach"})
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """One of the settings that a study compares: a method with all its options. It becomes a row of the study's table.
+
+    Attributes:
+        label: The setting's name in the study.
+        overrides: The overrides from which the setting is composed, as the user wrote them.
+        settings: The rollout's settings as nested plain values, without the task.
+        identity: Hashes of the weights and data that the setting reads.
+        varies: This setting's values of the keys that differ within its grid, by key. A grid is the settings that one
+            entry of the study expands into, because an override has several values.
+        name: Name of the grid. Empty: the label.
+    """
+
+    label: str
+    overrides: str
+    settings: Plain
+    identity: Identity
+    varies: Mapping[str, Any] = field(default_factory=dict)
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", self.name or self.label)
+
+    @functools.cached_property
+    def work(self) -> str:
+        """Hash of the settings, weights and data that determine a result. Task, seed and repeat are not included."""
+        return work_of(self.settings, self.identity)
+
+    @property
+    def depends_on_order(self) -> bool:
+        """Whether a result depends on the episodes before it in its block (group that one process runs).
+
+        It does if a skip rule adapts its threshold of similarity after each episode (docs/methods.md §4.3).
+        """
+        skip = self.settings["skip"]
+        return bool(skip.get("up") or skip.get("down"))
+
+    @property
+    def batch(self) -> int:
+        """Number of episodes that run at the same time. If it is more than 1, they are not timed."""
+        return int(self.settings["rollout"]["batch"])
+
+    def on(self, *tasks: str) -> RolloutSettings:
+        """Return the settings of a rollout on these tasks."""
+        return read_settings(RolloutSettings, {**self.settings, "task": list(tasks)})
+
+
+def differences(new: Setting, old: Setting | None = None, work: str = "") -> str:
+    """Describe in a few words how a setting differs from a stored one with the same label.
+
+    Args:
+        new: The setting.
+        old: The stored setting; None if there is none.
+        work: The hash under which `old` was stored.
+    """
+    target = new.settings["policy"]["target"]
+    if old is None or old.settings["policy"]["target"] != target:
+        return "new setting"
+    engine = next((one for one in range(ENGINE, 0, -1) if work_of(old.settings, old.identity, one) == work), ENGINE)
+    changes = [f"engine {engine} → {ENGINE}"] if engine != ENGINE else []
+    for kind in _differing(new.identity, old.identity):
+        if kind == "target":
+            changes.append(f"weights of {target} changed")
+        elif kind != OBSERVATION:
+            changes.append(f"{kind} changed")
+    before, after = flat(effective(old.settings)), flat(effective(new.settings))
+    changes += [f"{key} {before.get(key)} → {after.get(key)}" for key in _differing(after, before)]
+    return ", ".join(changes[:3]) or "new setting"
+
+
+def _differing(new: Mapping[str, Any], old: Mapping[str, Any]) -> list[str]:
+    """Return the keys that have different values in two mappings. A missing key has the value None."""
+    return [key for key in dict.fromkeys([*new, *old]) if new.get(key) != old.get(key)]
 
 
 def hash_of(value: object) -> str:
@@ -93,7 +170,7 @@ def effective(settings: Plain) -> dict[str, Any]:
     are left out, too.
     """
     try:
-        complete = settings_from(settings)
+        complete = read_settings(RolloutSettings, settings)
     except KervError:  # the settings name a part of a plugin that is not installed here
         return without(settings, NOT_DETERMINING)
     determining = without(asdict(complete), NOT_DETERMINING)
@@ -115,15 +192,6 @@ def _drop(settings: dict[str, Any], path: Sequence[str]) -> None:
     settings.pop(path[-1], None)
 
 
-def depends_on_order(settings: Plain) -> bool:
-    """Return whether an episode's result depends on the episodes before it in its block (group that one process runs).
-
-    It does if a skip rule adapts its similarity threshold after each episode (`skip.up`, `skip.down`).
-    """
-    skip = settings["skip"]
-    return bool(skip.get("up") or skip.get("down"))
-
-
 def stress_of(settings: Plain) -> dict[str, Any]:
     """Return the kind and level of a setting's stress, a disturbance of the world (docs/stress.md).
 
@@ -138,11 +206,6 @@ def stress_text(settings: Plain) -> str:
     """Return text to put after a setting's label: `, stress push 2`. Empty without stress."""
     stress = stress_of(settings)
     return f", stress {stress['kind']} {stress['level']}" if stress["level"] else ""
-
-
-def batch_of(settings: Plain) -> int:
-    """Return how many episodes of a setting run at the same time. If it is more than 1, they are not timed."""
-    return int(settings["rollout"]["batch"])
 
 
 def flat(settings: Plain, prefix: str = "") -> dict[str, Any]:

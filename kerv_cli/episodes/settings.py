@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import choice, number, setting
-from kerv_cli.base.settings import CommandSettings, TaskSettings, read_settings
+from kerv_cli.base.settings import CommandSettings, TaskSettings
 from kerv_cli.methods.settings import EXPERT, MethodSettings
 from kerv_cli.worlds.settings import EVALUATION_SEED, RolloutWorldSettings
 
@@ -120,8 +119,3 @@ class WorkSettings(CommandSettings):
 
     study: str = setting("", "name or file of the study")
     run: str = setting("", "only blocks of the command with this id, whose process ends this one by closing its input")
-
-
-def settings_from(plain: Mapping[str, Any]) -> RolloutSettings:
-    """Build a rollout's settings from nested dictionaries and lists, as they are stored."""
-    return read_settings(RolloutSettings, plain)

@@ -11,23 +11,13 @@ import itertools
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from operator import attrgetter
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
-from kerv_cli.episodes.identity import (
-    ENGINE,
-    OBSERVATION,
-    Identity,
-    Plain,
-    batch_of,
-    depends_on_order,
-    effective,
-    flat,
-    work_of,
-)
+from kerv_cli.episodes.identity import Setting, code_hash, differences
 
 MOST_EPISODES = 1_000_000
 """Largest number of episodes in a study."""
@@ -44,45 +34,6 @@ ran. ALL: all.
 Key = tuple[str, str, int, int]
 """A setting's hash `work`, task, seed and repeat. Equal keys mean the same episode in any study."""
 K = TypeVar("K")
-
-
-@dataclass(frozen=True, eq=False)
-class Setting:
-    """One of the settings that a study compares: a method with all its options. It becomes a row of the study's table.
-
-    Attributes:
-        label: The setting's name in the study.
-        overrides: The overrides from which the setting is composed, as the user wrote them.
-        settings: The rollout's settings as nested plain values, without the task.
-        identity: Hashes of the weights and data that the setting reads.
-        varies: This setting's values of the keys that differ within its grid, by key. A grid is the settings that one
-            entry of the study expands into, because an override has several values.
-        name: Name of the grid. Empty: the label.
-    """
-
-    label: str
-    overrides: str
-    settings: Plain
-    identity: Identity
-    varies: Mapping[str, Any] = field(default_factory=dict)
-    name: str = ""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "name", self.name or self.label)
-
-    @functools.cached_property
-    def work(self) -> str:
-        """Hash of the settings, weights and data that determine a result. Task, seed and repeat are not included."""
-        return work_of(self.settings, self.identity)
-
-    @functools.cached_property
-    def depends_on_order(self) -> bool:
-        """Whether a result depends on earlier episodes, because a skip rule adapts (docs/methods.md §4.3)."""
-        return depends_on_order(self.settings)
-
-    def on(self, task: str) -> dict[str, Any]:
-        """Return the rollout's settings with one task added, as nested plain values."""
-        return {**self.settings, "task": [task]}
 
 
 @dataclass(frozen=True)
@@ -191,7 +142,7 @@ class Block:
     @property
     def batch(self) -> int:
         """Number of episodes that run at the same time."""
-        return batch_of(self.episodes[0].setting.settings)
+        return self.episodes[0].setting.batch
 
     @property
     def name(self) -> str:
@@ -247,7 +198,6 @@ def split(
     Returns:
         Two mappings: from each existing episode to its row, and from each missing episode to the reason for running it.
     """
-    from kerv_cli.episodes.identity import code_hash
 
     def is_usable(row: StoredEpisode) -> bool:
         if rerun == ALL:
@@ -377,7 +327,7 @@ def blocks_of(episodes: Iterable[Episode], block: int, workers: int = 1) -> list
         block: Largest number of seeds in a block.
         workers: Number of processes.
     """
-    by_way = grouped(episodes, lambda one: batch_of(one.setting.settings) > 1)
+    by_way = grouped(episodes, lambda one: one.setting.batch > 1)
     groups: dict[tuple[object, ...], list[Episode]] = {}
     for (task, seed, repeat), turn in _turns(by_way.get(False, ())).items():
         for threads, part in grouped(turn, lambda one: one.setting.settings["runtime"]["threads"]).items():
@@ -387,37 +337,9 @@ def blocks_of(episodes: Iterable[Episode], block: int, workers: int = 1) -> list
             groups.setdefault((task, repeat, threads, index, *same), []).extend(part)
     blocks = list(map(Block, map(tuple, groups.values())))
     for group in grouped(by_way.get(True, ()), lambda one: (one.setting.work, one.repeat)).values():
-        size = min(FULL_BATCHES * batch_of(group[0].setting.settings), -(-len(group) // workers))
+        size = min(FULL_BATCHES * group[0].setting.batch, -(-len(group) // workers))
         blocks += [Block(tuple(group[first : first + size])) for first in range(0, len(group), size)]
     return blocks
-
-
-def differences(new: Setting, old: Setting | None = None, work: str = "") -> str:
-    """Describe in a few words how a setting differs from a stored one with the same label.
-
-    Args:
-        new: The setting.
-        old: The stored setting; None if there is none.
-        work: The hash under which `old` was stored.
-    """
-    target = new.settings["policy"]["target"]
-    if old is None or old.settings["policy"]["target"] != target:
-        return "new setting"
-    engine = next((one for one in range(ENGINE, 0, -1) if work_of(old.settings, old.identity, one) == work), ENGINE)
-    changes = [f"engine {engine} → {ENGINE}"] if engine != ENGINE else []
-    for kind in _differing(new.identity, old.identity):
-        if kind == "target":
-            changes.append(f"weights of {target} changed")
-        elif kind != OBSERVATION:
-            changes.append(f"{kind} changed")
-    before, after = flat(effective(old.settings)), flat(effective(new.settings))
-    changes += [f"{key} {before.get(key)} → {after.get(key)}" for key in _differing(after, before)]
-    return ", ".join(changes[:3]) or "new setting"
-
-
-def _differing(new: Mapping[str, Any], old: Mapping[str, Any]) -> list[str]:
-    """Return the keys that have different values in two mappings. A missing key has the value None."""
-    return [key for key in dict.fromkeys([*new, *old]) if new.get(key) != old.get(key)]
 
 
 def seeds_text(seeds: Iterable[int]) -> str:

@@ -18,6 +18,7 @@ from kerv_cli.base.errors import UsageError, did_you_mean
 from kerv_cli.base.limits import check_label
 from kerv_cli.base.paths import check_name
 from kerv_cli.base.settings import RuntimeSettings
+from kerv_cli.episodes.identity import Setting
 from kerv_cli.lab.database import (
     BLOCKS,
     DECODES,
@@ -33,7 +34,7 @@ from kerv_cli.lab.database import (
     measures_in,
     now,
 )
-from kerv_cli.lab.plan import NEVER, Block, Episode, Key, Setting, StoredEpisode, blocks_of, grouped, split
+from kerv_cli.lab.plan import NEVER, Block, Episode, Key, StoredEpisode, blocks_of, grouped, split
 from kerv_cli.lab.runs import Run, run_rows
 
 if TYPE_CHECKING:

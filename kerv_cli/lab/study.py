@@ -17,11 +17,12 @@ from kerv_cli.base.errors import Interrupted, KervError, StorageError, UsageErro
 from kerv_cli.base.paths import check_writable
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import RuntimeSettings
+from kerv_cli.episodes.identity import Setting
 from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.resolve import ResolvedStudy
 from kerv_cli.episodes.runner import close_worlds
 from kerv_cli.lab.database import EPISODES, PLANNED, SETTINGS, STUDIES, WANTED, Database
-from kerv_cli.lab.plan import ALL, Episode, Setting, all_episodes
+from kerv_cli.lab.plan import ALL, Episode, all_episodes
 from kerv_cli.lab.runs import Run, interrupted
 from kerv_cli.lab.store import ABOUT, ROLLOUT, SWEEP, Study
 from kerv_cli.lab.work import (

@@ -31,13 +31,12 @@ import sqlalchemy as sa
 from kerv_cli.base.errors import CheckpointError, KervError, StorageError
 from kerv_cli.base.runtime import set_up
 from kerv_cli.engine.record import EpisodeRecord
-from kerv_cli.episodes.identity import ENGINE, OBSERVATION, code_hash
+from kerv_cli.episodes.identity import ENGINE, OBSERVATION, Setting, code_hash
 from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.rows import decodes_table, episode_row, seconds_blob, table_blob
 from kerv_cli.episodes.runner import Request, Runner, close_worlds, is_recorded, run_batch
-from kerv_cli.episodes.settings import settings_from
 from kerv_cli.lab.database import QUEUE, SETTINGS, STUDIES, Unanswered, clock, now
-from kerv_cli.lab.plan import Block, Episode, Setting, StoredEpisode, seeds_text, split
+from kerv_cli.lab.plan import Block, Episode, StoredEpisode, seeds_text, split
 from kerv_cli.lab.runs import is_running
 from kerv_cli.lab.store import ROLLOUT, Study, setting_of
 from kerv_cli.targets.provenance import stamp
@@ -160,7 +159,7 @@ def work_on(study: Study, run_id: str, on_event: OnEvent, save: Save) -> None:
     if not run_id:  # a sweep of this machine has checked its settings
         study = study.load()
         for setting in study.settings:
-            set_up(settings_from(setting.on(study.tasks[0])).runtime)
+            set_up(setting.on(study.tasks[0]).runtime)
             checked(setting, study.tasks, str(study.database.results))
     try:
         work(Queue(study, run_id), EpisodeRunner(study.rollouts, save), on_event)
@@ -182,15 +181,15 @@ def checked(setting: Setting, tasks: list[str], results: str) -> Setting:
     Raises:
         CheckpointError: The weights or data of the setting have changed.
     """
-    stored = {**setting.settings, "results": results}
-    identity = check(settings_from({**stored, "task": tasks}))
+    here = replace(setting, settings={**setting.settings, "results": results})
+    identity = check(here.on(*tasks))
     for kind in setting.identity.keys() | identity.keys():
         before, now = setting.identity.get(kind, "none"), identity.get(kind, "none")
         if kind != OBSERVATION and before != now:
             raise CheckpointError(
                 f"the {kind} of {setting.label} has changed from {before[:12]} to {now[:12]}: it cannot run again"
             )
-    return replace(setting, settings=stored, identity=identity)
+    return replace(here, identity=identity)
 
 
 def work(queue: Queue, prepare: Prepare, on_event: OnEvent = lambda event: None) -> None:
@@ -686,7 +685,7 @@ class EpisodeRunner:
 
     def __call__(self, setting: Setting, task: str) -> Callable[[int], EpisodeRecord]:
         """Build the setting's decoder for a task. Return a function that runs the episode with a given seed."""
-        runner = Runner(settings_from(setting.on(task)), task)
+        runner = Runner(setting.on(task), task)
 
         def run_episode(seed: int) -> EpisodeRecord:
             record = runner.episode(seed, is_recorded(runner.settings, seed))
@@ -702,7 +701,7 @@ class EpisodeRunner:
         Yield each episode with its record, or with the error that its world raised.
         """
         setting = episodes[0].setting
-        settings = settings_from(setting.on(episodes[0].task))
+        settings = setting.on(episodes[0].task)
         requests = [Request(one, one.task, one.seed) for one in episodes]
         for request, result in run_batch(settings, requests):
             yield request.key, result

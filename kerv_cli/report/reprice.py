@@ -18,7 +18,6 @@ import pyarrow.compute as pc
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.rows import values_of
 from kerv_cli.engine.cost import COUNTED, READ_PHASES, Profile, Work, prices, read_profile, work_of
-from kerv_cli.episodes.identity import batch_of
 from kerv_cli.report.measures import measure, paired
 from kerv_cli.report.profiles import ENCODERS, NamedProfile, open_profiles
 from kerv_cli.report.results import Measures, Result, Row, averaged, columns_of
@@ -175,7 +174,7 @@ def _work_of_label(data: StudyData, label: str) -> _LabelWork:
         UsageError: The setting's episodes ran in a batch and have no times.
     """
     setting = data.settings[label]
-    if (batch := batch_of(setting.settings)) > 1:
+    if (batch := setting.batch) > 1:
         raise UsageError(
             f"setting '{label}' ran {batch} episodes at a time, without times: run it with rollout.batch=1"
         )

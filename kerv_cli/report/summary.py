@@ -17,7 +17,7 @@ from rich.text import Text
 from kerv_cli.base.durations import count
 from kerv_cli.base.rows import distinct, values_of
 from kerv_cli.engine.record import PHASES
-from kerv_cli.episodes.identity import batch_of, stress_text
+from kerv_cli.episodes.identity import stress_text
 from kerv_cli.report.results import MICRO, Result, averaged, is_number
 from kerv_cli.report.statistics import Estimate
 from kerv_cli.report.tables import StudyData
@@ -227,7 +227,7 @@ def setting_tables(data: StudyData) -> Iterator[tuple[Any, Any, str]]:
     title = f"{setting.label}, observation {observation}{stress_text(setting.settings)}, seeds {seeds}"
     timed = episodes["seconds"].notna().all()
     if not timed:
-        title += f"; not timed: {batch_of(setting.settings)} episodes at a time"
+        title += f"; not timed: {setting.batch} episodes at a time"
     yield rows[0].keys(), list(map(dict.values, rows)), title
     if timed:
         decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()

@@ -18,8 +18,8 @@ import pyarrow.compute as pc
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.rows import distinct, keyed, values_of
-from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, flat, stress_of, without
-from kerv_cli.lab.plan import Episode, Setting, seeds_text
+from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, Setting, flat, stress_of, without
+from kerv_cli.lab.plan import Episode, seeds_text
 from kerv_cli.lab.store import Study
 from kerv_cli.report import statistics as stats
 from kerv_cli.report.measures import Speeds, compared, measure, paired, speedups
