@@ -184,10 +184,10 @@ def checked(setting: Setting, tasks: list[str], results: str) -> Setting:
     here = replace(setting, settings={**setting.settings, "results": results})
     identity = check(here.on(*tasks))
     for kind in setting.identity.keys() | identity.keys():
-        before, now = setting.identity.get(kind, "none"), identity.get(kind, "none")
-        if kind != OBSERVATION and before != now:
+        before, after = setting.identity.get(kind, "none"), identity.get(kind, "none")
+        if kind != OBSERVATION and before != after:
             raise CheckpointError(
-                f"the {kind} of {setting.label} has changed from {before[:12]} to {now[:12]}: it cannot run again"
+                f"the {kind} of {setting.label} has changed from {before[:12]} to {after[:12]}: it cannot run again"
             )
     return replace(here, identity=identity)
 
@@ -557,21 +557,21 @@ class _Attempt:
             first = next((one for one in self.left if one.setting.work == setting.work), None)
             if first is not None:
                 self.on_event(Preparing(setting, number, len(settings)))
-                runner = self._try(first, functools.partial(self.prepare, setting, first.task))
+                runner = self._try(first, self.prepare, setting, first.task)
                 if runner is not None:
                     runners[setting.work] = runner
         for order, one in enumerate(list(self.left)):
             if one in self.left:
                 started = datetime.now(UTC)
-                record = self._try(one, functools.partial(runners[one.setting.work], one.seed))
+                record = self._try(one, runners[one.setting.work], one.seed)
                 if record is not None:
                     self._end(one, record, order, started)
 
-    def _try(self, one: Episode, function: Callable[[], Any]) -> Any:
+    def _try(self, one: Episode, function: Callable[..., Any], *arguments: Any) -> Any:
         """Call a function for episode `one`. If it raises, its setting has failed: return None."""
         self._begin(one)
         try:
-            return function()
+            return function(*arguments)
         except Exception as error:  # noqa: BLE001 - the other settings go on
             self._fail(one, failure_of(error))
         return None
@@ -593,16 +593,11 @@ class _Attempt:
                 elif one in self.left:
                     started = datetime.now(UTC) - timedelta(seconds=result.wall_seconds)
                     self._end(one, result, next(order), started)
-        except KervError as error:
-            if isinstance(error, ClaimLost | StorageError):
-                raise
-            self._fail_all(error)
+        except (ClaimLost, StorageError):
+            raise
         except Exception as error:  # noqa: BLE001 - the other blocks go on
-            self._fail_all(error)
-
-    def _fail_all(self, error: Exception) -> None:
-        while self.left:
-            self._fail(self.left[0], failure_of(error))
+            while self.left:
+                self._fail(self.left[0], failure_of(error))
 
     def _end(self, one: Episode, record: EpisodeRecord, order: int, started: datetime) -> None:
         """Commit an episode that has ended."""
