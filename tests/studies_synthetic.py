@@ -123,7 +123,8 @@ def swept(
     command = ["sweep", f"study={study.name}"]
     study = plan_study(opened(results), study, rerun, runtime=runtime, command=command)
     prepare = prepare or episodes_of
-    with Run(study.database, study.kind, study.name, command, alone=False) as record, pretending(prepare):
+    total = len(study.to_run)
+    with Run(study.database, study.kind, study.name, command, total, alone=False) as record, pretending(prepare):
         return study, run_blocks(study, prepare, record, on_event)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -15,6 +16,7 @@ from kerv_cli.cli.common import AsJson, end_with_json
 if TYPE_CHECKING:
     from kerv_cli.lab.database import Database
     from kerv_cli.report.report import Report
+    from kerv_cli.report.reprice import Priced
 
 
 @dataclass
@@ -89,7 +91,8 @@ def _as_json(reports: list[Report]) -> dict[str, object]:
     """Return what reports contain, as JSON values."""
     from kerv_cli.report.reprice import prices_table
 
-    files, priced = [], []
+    files: list[Path] = []
+    priced: list[Priced] = []
     studies, acceptance = {}, {}
     for one in reports:
         name, data = one.data.name, one.data

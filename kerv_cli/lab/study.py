@@ -149,7 +149,7 @@ def run(study: Study, on_event: OnEvent = lambda event: None, *, save: Save = la
 
     prepare = EpisodeRunner(study.rollouts, save)
     try:
-        with Run(study.database, study.kind, study.name, study.command, alone=is_rollout) as record:
+        with Run(study.database, study.kind, study.name, study.command, len(study.to_run), is_rollout) as record:
             try:
                 return run_blocks(study, prepare, record, forward)
             except KeyboardInterrupt:
@@ -245,7 +245,6 @@ class Progress:
         self.outcome = Outcome(reused=list(study.existing))
         self._missing = {one.key: one for one in study.to_run}
         self._newest, self._began = study.newest, time.perf_counter()
-        record.beat(0, len(self._missing))
         is_timed = any(block.batch == 1 for block in study.blocks)
         on_event(Started(len(self._missing), len(study.existing), load_per_core() if is_timed else 0.0))
 
