@@ -29,7 +29,7 @@ from kerv_cli.worlds.settings import EVALUATION_SEED
 
 
 def settings(results: Path, *overrides: str) -> RolloutSettings:
-    common = ["world.horizon=10", "record=0", f"results={results}"]
+    common = ["task=drawer-open", "world.horizon=10", "record=0", f"results={results}"]
     return compose("rollout", [*common, *overrides], RolloutSettings)
 
 
@@ -304,6 +304,7 @@ def test_ar_takes_what_was_asked_for_and_the_others_their_share(results):
 
 def test_a_profile_is_part_of_the_results_identity(results):
     words = [f"results={results}", "policy.target=nano-state", "rollout.clock=real", "rollout.latency=profile"]
+    words.append("task=drawer-open")
     chosen = compose("rollout", [*words, "rollout.profile=there"], RolloutSettings)
     found = []
     for seconds in (0.005, 0.006):

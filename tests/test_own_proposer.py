@@ -89,7 +89,7 @@ def test_it_is_trained_from_the_command_line_and_drafts_in_every_place(results):
     assert described["settings"] == {"kind": "follow", "share": 0.5}
     run("rollout", "task=[reach]", "prefill_draft=follow", "episodes=1", "world.horizon=12", "record=0")
     for overrides, wanted in PLACES.items():
-        asked = compose("rollout", [*POLICY, f"results={results}", *overrides.split()], RolloutSettings)
+        asked = compose("rollout", [*POLICY, "task=reach", f"results={results}", *overrides.split()], RolloutSettings)
         method, files = Method.of(asked), Artifacts(asked.results, asked.policy)
         assert set(method.needs) == wanted
         identity = check(asked)
