@@ -48,7 +48,6 @@ from kerv_cli.lab.work import (
     Queue,
     SettingFailed,
     Started,
-    enqueue,
     work,
 )
 from kerv_cli.lab.workers import LocalWorkers, disturbances, gpus_in_turn
@@ -213,7 +212,7 @@ def test_workers_of_a_killed_sweep_end_and_its_claims_are_taken_over(tmp_path, m
 def waiting(database: Database, study: Study, run: str = "run") -> Study:
     """Plan a study and queue its blocks, which nobody runs yet."""
     study = plan_study(database, study)
-    enqueue(study, run)
+    Queue(study, run).fill()
     return study
 
 
@@ -367,7 +366,7 @@ for workers in (1, 2, 4):
             setting.settings["seed"] = 100_000 + 100 * block + 10 * workers
         episodes = s.all_episodes(study.settings, ["reach-v3"], block)
         study = s.replace(study, episodes=episodes)
-        work.enqueue(s.plan_study(opened(results), study), "run")
+        work.Queue(s.plan_study(opened(results), study), "run").fill()
         died = crew(Study(opened(results), study.name), workers)
         print(study.name, died)
 """
@@ -385,7 +384,7 @@ def test_any_number_of_workers_run_each_episode_once_though_some_are_killed(data
 
 AT_ONCE = """
 study = s.threshold_study(["reach-v3", "push-v3"], episodes=4, radii=(3,), block=2)
-work.enqueue(s.plan_study(opened(results), study), "earlier")
+work.Queue(s.plan_study(opened(results), study), "earlier").fill()
 store = Study(opened(results), study.name)
 children = [begun(store) for _ in range(3)] + [parted(s.swept, results, study, prepare) for _ in range(2)]
 assert [os.waitpid(child, 0)[1] for child in children] == [0] * 5
@@ -482,7 +481,7 @@ def test_a_worker_counts_its_episodes_without_a_total(capsys):
 IN_ORDER = """
 from test_execute import in_order
 study = in_order()
-work.enqueue(s.plan_study(opened(results), study), "run")
+work.Queue(s.plan_study(opened(results), study), "run").fill()
 assert crew(Study(opened(results), study.name), 1) == 2
 """
 

@@ -16,7 +16,6 @@ import sqlalchemy as sa
 from kerv_cli.base.errors import Interrupted, KervError, StorageError, UsageError
 from kerv_cli.base.paths import check_writable
 from kerv_cli.base.runtime import set_up
-from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.episodes.identity import Setting
 from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.resolve import ResolvedStudy
@@ -36,7 +35,6 @@ from kerv_cli.lab.work import (
     Save,
     SettingFailed,
     Started,
-    enqueue,
     load_per_core,
     patiently,
     work,
@@ -72,7 +70,10 @@ def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], ki
     about, settings = resolved.study, []
     for label, one in resolved.settings.items():
         point, identity = resolved.points[label], check(one)
-        one.runtime.device = _device_of(one.runtime)
+        if one.runtime.executor != SLURM:
+            one.runtime.device, _ = set_up(one.runtime)
+        elif one.runtime.device == "auto":  # that of the nodes: this machine may have no GPU
+            one.runtime.device = "cuda" if one.runtime.executor_options.gpus else "cpu"
         plain = asdict(one)
         del plain["task"]
         settings.append(Setting(label, " ".join(point.overrides), plain, identity, point.varies, point.name))
@@ -89,14 +90,6 @@ def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], ki
         begun = begun if 0 < done < total else None
         study = replace(study, name=begun.name if begun else new_name(study))
     return study.plan(rerun, begun.started if begun else "", runtime, command)
-
-
-def _device_of(runtime: RuntimeSettings) -> str:
-    """Return the device on which episodes run. On a cluster it is that of the nodes: this machine may have no GPU."""
-    if runtime.executor != SLURM:
-        return set_up(runtime)[0]
-    on_node = "cuda" if runtime.executor_options.gpus else "cpu"
-    return on_node if runtime.device == "auto" else runtime.device
 
 
 def new_name(study: Study) -> str:
@@ -180,7 +173,7 @@ def run_blocks(study: Study, prepare: Prepare, record: Run, on_event: OnEvent) -
     """
     runtime, blocks = study.runtime, study.blocks
     queue, progress = Queue(study, record.id), Progress(study, record, on_event)
-    enqueue(study, record.id)
+    queue.fill()
     threads = max((one.setting.settings["runtime"]["threads"] for one in study.to_run), default=1)
     try:
         if blocks and runtime.executor == SLURM:
@@ -188,11 +181,11 @@ def run_blocks(study: Study, prepare: Prepare, record: Run, on_event: OnEvent) -
             if runtime.detach:
                 raise Detached(f"job {array.id} of Slurm runs them, its logs are in {array.logs}")
             with array:
-                follow(queue, progress, lambda: array.tend(len(progress.outcome.done) + len(progress.outcome.failed)))
+                progress.follow(queue, lambda: array.tend(progress.ended))
         elif blocks and runtime.workers > 1:
             number = min(runtime.workers, len(blocks))
             with LocalWorkers(queue, number, threads, gpus_in_turn(study.device)) as workers:
-                follow(queue, progress, workers.tend)
+                progress.follow(queue, workers.tend)
         elif blocks:
             work(queue, prepare, progress.see)
         return progress.end()
@@ -210,25 +203,6 @@ def _kept(study: Study) -> str:
         return "{} of {} episodes".format(*study.counts())
     except StorageError:
         return "all complete episodes"
-
-
-def follow(queue: Queue, progress: Progress, tend: Callable[[], None]) -> None:
-    """Wait until every block (group of episodes) of a queue has ended. Show the progress of the workers that run them.
-
-    Args:
-        queue: The blocks.
-        progress: Reads from the database what has ended.
-        tend: Replaces workers that have ended. It is called each time before the database is read.
-    """
-    shown: set[tuple[int, str]] = set()
-    while patiently(queue.left)[0]:
-        tend()
-        for position, worker in patiently(queue.claimed):
-            if (position, worker) not in shown:
-                shown.add((position, worker))
-                progress.on_event(BlockStarted(progress.study.blocks[position]))
-        patiently(progress.look)
-        time.sleep(FOLLOW_SECONDS)
 
 
 class Progress:
@@ -265,6 +239,11 @@ class Progress:
             self.look()
         self.on_event(event)
 
+    @property
+    def ended(self) -> int:
+        """Number of episodes and settings that have ended or failed so far."""
+        return len(self.outcome.done) + len(self.outcome.failed)
+
     def look(self) -> None:
         """Read from the database which episodes other processes have run, and which have failed."""
         for ended in self._ended():
@@ -294,6 +273,23 @@ class Progress:
             reason, _, trace = error.partition("\n")
             found.append(SettingFailed(reason, trace, episodes=tuple(episodes)))
         return found
+
+    def follow(self, queue: Queue, tend: Callable[[], None]) -> None:
+        """Wait until every block (group of episodes) of a queue has ended. Show the progress of the workers.
+
+        Args:
+            queue: The blocks.
+            tend: Replaces workers that have ended. It is called each time before the database is read.
+        """
+        shown: set[tuple[int, str]] = set()
+        while patiently(queue.left)[0]:
+            tend()
+            for position, worker in patiently(queue.claimed):
+                if (position, worker) not in shown:
+                    shown.add((position, worker))
+                    self.on_event(BlockStarted(self.study.blocks[position]))
+            patiently(self.look)
+            time.sleep(FOLLOW_SECONDS)
 
     def end(self) -> Outcome:
         """Return the outcome, after all blocks have ended.

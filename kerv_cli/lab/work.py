@@ -273,6 +273,26 @@ class Queue:
         self._claimed: int | None = None
         self._settings: dict[str, Setting] = {}  # those of earlier blocks, by their hashes
 
+    def fill(self) -> None:
+        """Write the planned study and its blocks, in one transaction.
+
+        Blocks of the same tasks that an earlier command has planned are removed, unless that command or a worker still
+        runs them.
+        """
+        study = self.study
+        about = {"executor": study.runtime.executor, "workers": study.runtime.workers}
+        with self.database.writing() as connection:
+            number = study.save_in(connection)
+            earlier = sa.select(QUEUE).where(QUEUE.c.study_id == number, _is_free(connection))
+            for row in connection.execute(earlier).all():
+                tasks = {task for _, task, *_ in row.episodes}
+                if tasks.issubset(study.tasks) and not is_running(connection, row.run):
+                    connection.execute(sa.delete(QUEUE).where(QUEUE.c.id == row.id))
+            common = {"study_id": number, "run": self.run, "newest": study.newest, "about": about}
+            rows = [{**common, "position": place, "episodes": block.keys} for place, block in enumerate(study.blocks)]
+            if rows:
+                connection.execute(sa.insert(QUEUE), rows)
+
     def claim(self, ended: Claim | None = None) -> Claim | None:
         """Claim the first free block. Return None if none is free now.
 
@@ -438,29 +458,6 @@ class Queue:
         """Remove the blocks that nobody runs."""
         with self.database.writing() as connection:
             connection.execute(sa.delete(QUEUE).where(self._mine(), _is_free(connection)))
-
-
-def enqueue(study: Study, run: str) -> None:
-    """Write a planned study and its blocks, in one transaction.
-
-    Blocks of the same tasks that an earlier command has planned are removed, unless that command or a worker still
-    runs them.
-
-    Args:
-        study: The study with its plan.
-        run: Id of the command that made the plan.
-    """
-    about = {"executor": study.runtime.executor, "workers": study.runtime.workers}
-    with study.database.writing() as connection:
-        number = study.save_in(connection)
-        for row in connection.execute(sa.select(QUEUE).where(QUEUE.c.study_id == number, _is_free(connection))).all():
-            tasks = {task for _, task, *_ in row.episodes}
-            if tasks.issubset(study.tasks) and not is_running(connection, row.run):
-                connection.execute(sa.delete(QUEUE).where(QUEUE.c.id == row.id))
-        common = {"study_id": number, "run": run, "newest": study.newest, "about": about}
-        rows = [{**common, "position": place, "episodes": block.keys} for place, block in enumerate(study.blocks)]
-        if rows:
-            connection.execute(sa.insert(QUEUE), rows)
 
 
 def _is_free(connection: sa.Connection) -> sa.ColumnElement[bool]:
