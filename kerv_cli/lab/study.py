@@ -81,14 +81,14 @@ def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], ki
     episodes = all_episodes(settings, resolved.tasks, about.block, about.repeats)
     own = {name: getattr(about, name) for name in ABOUT}
     study = Study(database, about.name, kind, tuple(settings), episodes, **own)
-    if kind == ROLLOUT:
-        rerun, runtime = ALL, replace(runtime, workers=1, executor="local")
-    known = None if kind == ROLLOUT else study.name  # a new rollout has no name yet
-    begun = interrupted(database, kind, command, known) if rerun == ALL else None
-    if kind == ROLLOUT:
+    if kind == SWEEP:
+        begun = interrupted(database, kind, command, study.name) if rerun == ALL else None
+    else:
+        begun = interrupted(database, kind, command)
         done, total = replace(study, name=begun.name).counts() if begun else (0, 0)
         begun = begun if 0 < done < total else None
         study = replace(study, name=begun.name if begun else new_name(study))
+        rerun, runtime = ALL, replace(runtime, workers=1, executor="local")
     return study.plan(rerun, begun.started if begun else "", runtime, command)
 
 
