@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import gc
 import hashlib
 import importlib.util
 import json
@@ -302,9 +303,13 @@ def code_hash() -> str:
     kerv's own files and of registered plugins. Comments, docstrings and formatting do not change it.
     """
     digest = hashlib.sha256()
-    for name, path in sorted(_computing_files()):
-        content = _meaning(path.read_bytes()) if path.suffix == ".py" else path.read_bytes()
-        digest.update(f"{name}\0".encode() + hashlib.sha256(content).digest())
+    gc.disable()  # syntax trees hold no cycles, and a search among all objects of the libraries takes as long as they
+    try:
+        for name, path in sorted(_computing_files()):
+            content = _meaning(path.read_bytes()) if path.suffix == ".py" else path.read_bytes()
+            digest.update(f"{name}\0".encode() + hashlib.sha256(content).digest())
+    finally:
+        gc.enable()
     return digest.hexdigest()
 
 
@@ -313,32 +318,29 @@ def _meaning(source: bytes) -> bytes:
 
     The text is the same in every version of Python. That of `ast.dump` is not.
     """
-    return json.dumps(_plain(_Essential().visit(ast.parse(source)))).encode()
+    return json.dumps(_plain(ast.parse(source))).encode()
 
 
 def _plain(node: object) -> object:
-    """Return a syntax tree as lists and strings. Empty fields are left out: newer versions of Python have more."""
+    """Return a syntax tree without docstrings as lists and strings.
+
+    What only some versions of Python have is left out: empty fields, and empty strings in f-strings.
+    """
     if isinstance(node, list):
-        return list(map(_plain, node))
+        return [_plain(one) for one in node if not _is_docstring(one)]
     if not isinstance(node, ast.AST):
         return ascii(node)
     plain: list[object] = [type(node).__name__]
     for name, value in ast.iter_fields(node):
-        if value not in (None, []):
-            plain.append((name, _plain(value)))
+        if isinstance(node, ast.JoinedStr):
+            value = list(filter(_is_not_empty, value))
+        if value is not None and (found := _plain(value)) != []:
+            plain.append((name, found))
     return plain
 
 
-class _Essential(ast.NodeTransformer):
-    """Removes docstrings, and the empty strings that some versions of Python add to f-strings."""
-
-    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
-        alone = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
-        return None if alone else self.generic_visit(node)  # type: ignore[return-value]
-
-    def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.AST:
-        node.values = list(filter(_is_not_empty, node.values))
-        return self.generic_visit(node)
+def _is_docstring(node: object) -> bool:
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
 
 
 def _is_not_empty(node: ast.expr) -> bool:
