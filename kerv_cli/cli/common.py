@@ -71,13 +71,14 @@ def settings_yaml(settings: Any, indent: str = "") -> str:
     import yaml
 
     lines = []
+    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # the one in C, if PyYAML has it, is ten times faster
     for setting in fields(settings):
         value = getattr(settings, setting.name)
         if is_dataclass(value):
             lines += [f"{setting.name}:", *settings_yaml(value, "  ").splitlines()]
             continue
         # without a maximum width, so that a string without line breaks is one line
-        text = yaml.safe_dump({setting.name: value}, width=2**30, sort_keys=False, allow_unicode=True)
+        text = yaml.dump({setting.name: value}, Dumper=dumper, width=2**30, sort_keys=False, allow_unicode=True)
         first, *rest = text.splitlines()
         comment = description(setting) if not rest or not isinstance(value, str) else ""
         lines += [f"{first}  # {comment}" if comment else first, *rest]
