@@ -283,13 +283,15 @@ def curves_figure(log: pd.DataFrame) -> alt.ConcatChart:
 
 def _chart(panels: list[alt.LayerChart], across: int) -> alt.ConcatChart:
     """Put panels side by side, `across` in a row. Add the look of all charts, and the parameter `picked`."""
-    return alt.concat(*panels, columns=across, spacing=28, config=_CONFIG).add_params(alt.param("picked", value=""))
+    chart = alt.concat(*panels, columns=across, spacing=28, config=_CONFIG)
+    chart.params = [alt.param("picked", value="").param]  # `add_params` would copy the panels again and again
+    return chart
 
 
 def png(figure: alt.ConcatChart, title: str, subtitle: str) -> bytes:
     """Return a chart with a heading as a PNG file. The same chart gives the same bytes."""
     heading = alt.Title(title, subtitle=subtitle, fontSize=17, subtitleFontSize=12, offset=16)
-    spec = figure.properties(title=heading, background="white", padding=14).to_dict()
+    spec = figure.properties(title=heading, background="white", padding=14).to_dict(validate=False)
     buffer = io.BytesIO()  # written again: the renderer hardly compresses
     Image.open(io.BytesIO(vl_convert.vegalite_to_png(spec, scale=2))).convert("RGB").save(buffer, "png", optimize=True)
     return buffer.getvalue()
