@@ -31,7 +31,7 @@ def serve(settings: ServeSettings, plan: ShowPlan = False) -> None:
     with server.listening(settings.host, settings.port) as port, contextlib.suppress(KeyboardInterrupt):
         _log(f"{settings.policy.target} with {settings.method} listens on ws://{settings.host}:{port}")
         never = threading.Event()
-        while not never.wait(0.5):  # the system may give a signal to another thread, and that does not wake this one
+        while not never.wait(0.1):  # the system may give a signal to another thread, and that does not wake this one
             pass
     _log("stopped")
     end_at_once()

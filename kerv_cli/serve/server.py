@@ -41,7 +41,7 @@ PATIENCE = 1.0
 """Seconds for which a new client waits until another one leaves. Its own last connection may just be closing."""
 FAREWELL = 2.0
 """Seconds for which the server waits for one client to close its connection."""
-LAST_ANSWERS = 1.0
+LAST_ANSWERS = 0.5
 """Seconds for which a stopping server waits for answers that are being computed, and for clients to disconnect."""
 
 
