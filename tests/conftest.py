@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import multiprocessing
 import os
 import secrets
 import shutil
@@ -14,6 +15,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
+from multiprocessing import forkserver
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +39,10 @@ ENVIRONMENTS = dict(registry.parts("environment"))
 
 
 LONGEST = (
-    *("test_execute", "test_packaging", "test_cli", "test_training", "test_golden", "test_prepare", "test_program"),
-    *("test_documented_commands", "test_board", "test_scout", "test_plan", "test_views", "test_database"),
-    *("test_extending", "test_vla_eval", "test_lerobot", "test_api", "test_batched", "test_sim_world"),
+    *("test_execute", "test_cli", "test_packaging", "test_golden", "test_studies_tables", "test_proposers"),
+    *("test_prepare", "test_program", "test_lerobot", "test_runs", "test_training", "test_board", "test_stress"),
+    *("test_database", "test_batched", "test_plan", "test_documented_commands", "test_reprice", "test_calibration"),
+    *("test_extending", "test_views", "test_vla_eval", "test_api", "test_sim_demos", "test_sim_world", "test_scout"),
 )
 """Files that take longest, begun first: no process is left with one of them at the end while the others idle."""
 
@@ -149,6 +153,27 @@ def quick_training(monkeypatch):
 
 
 @contextlib.contextmanager
+def without_charts() -> Iterator[None]:
+    """Leave the charts of reports empty: to draw them takes most of the time of a short sweep."""
+    import altair
+
+    from kerv_cli.report import plots, report
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("lines_figure", "_tradeoff"):
+            patch.setattr(plots, name, lambda *_: altair.concat())
+        patch.setattr(report, "png", lambda *_: b"")
+        yield
+
+
+@pytest.fixture(scope="module")
+def quick_report():
+    """The charts of reports are empty in this module."""
+    with without_charts():
+        yield
+
+
+@contextlib.contextmanager
 def refused(*says: str, error: type[KervError] = KervError) -> Iterator[None]:
     """Expect that the block is refused in one line that holds these words."""
     with pytest.raises(error) as caught:
@@ -196,14 +221,25 @@ def browser():
 
 
 @contextlib.contextmanager
-def python(script: str, *arguments: object) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a script, which can import this folder's modules, until the end of the block."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-    with subprocess.Popen([sys.executable, "-c", script, *map(str, arguments)], env=environment) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
+def python(script: str, *arguments: object) -> Iterator[ForkServerProcess]:
+    """Run a script, which can import this folder's modules, in a new process until the end of the block.
+
+    The process is forked from one that has imported the libraries: to import them takes longer than most scripts.
+    """
+    from preloaded import run
+
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["preloaded"])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join(path for path in sys.path if path))
+        forkserver.ensure_running()
+        process = context.Process(target=run, args=(script, [*map(str, arguments)], dict(os.environ), sys.path))
+        process.start()
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.join()
 
 
 def raising(error: BaseException, label: str = "", seeds: Sequence[int] = ()) -> Any:

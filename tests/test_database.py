@@ -131,7 +131,8 @@ if all(others):
 
 def test_first_commands_at_once_create_one_set_of_tables(database, tmp_path):
     with python(BEGUN + WRITERS, tmp_path) as process:
-        assert process.wait(60) == 0
+        process.join(60)
+        assert process.exitcode == 0
     assert count(database, STUDIES) == 40
 
 
@@ -145,7 +146,8 @@ with database.writing() as connection:
 def test_a_kill_in_a_transaction_leaves_nothing(database, tmp_path):
     begun(database, "a")
     with python(BEGUN + KILLED, tmp_path) as process:
-        assert process.wait(60) == -signal.SIGKILL
+        process.join(60)
+        assert process.exitcode == -signal.SIGKILL
     begun(database, "b")
     assert count(database, STUDIES) == 2
 

@@ -54,14 +54,16 @@ from kerv_cli.lab.workers import LocalWorkers, disturbances, gpus_in_turn
 from kerv_cli.report.tables import further_of, load_study
 from kerv_cli.worlds import EnvironmentPart
 
+pytestmark = pytest.mark.usefixtures("quick_report")
+
 STUDY = threshold_study(["reach-v3"])
 TWO = threshold_study(["reach-v3", "push-v3"])
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    monkeypatch.setattr("kerv_cli.lab.work.POLL_SECONDS", 0.02)
-    monkeypatch.setattr("kerv_cli.lab.study.FOLLOW_SECONDS", 0.02)
+    monkeypatch.setattr("kerv_cli.lab.work.POLL_SECONDS", 0.05)
+    monkeypatch.setattr("kerv_cli.lab.study.FOLLOW_SECONDS", 0.1)
 
 
 def queued(database: Database) -> int:
@@ -73,6 +75,12 @@ def queued(database: Database) -> int:
 def episodes(database: Database) -> int:
     with database.reading() as connection:
         return int(connection.scalar(sa.select(sa.func.count()).select_from(EPISODES)) or 0)
+
+
+def running(database: Database) -> list[object]:
+    """Return what the queue says of the episodes that run."""
+    with database.reading() as connection:
+        return list(connection.scalars(sa.select(QUEUE.c.running)))
 
 
 def errors(database: Database) -> list[str]:
@@ -179,8 +187,7 @@ import os
 import sys
 import studies_synthetic as s
 from kerv_cli.lab import study, work
-work.POLL_SECONDS = study.FOLLOW_SECONDS = 0.02
-work.code_hash(), work.stamp("cpu")  # once, before the processes part
+work.POLL_SECONDS, study.FOLLOW_SECONDS = 0.05, 0.1
 study = s.threshold_study(["reach-v3", "push-v3"], episodes=2, radii=(3,))
 number, processes = int(sys.argv[3]), int(sys.argv[4])
 children = []
@@ -202,7 +209,6 @@ def test_workers_of_a_killed_sweep_end_and_its_claims_are_taken_over(tmp_path, m
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
         assert children
         process.kill()
-        process.wait()
     until(lambda: not any(Path(f"/proc/{child}").exists() for child in children), 5.0)
     assert (store.counts(), queued(store.database)) == ((6, 12), 1)
     _, outcome = swept(tmp_path, threshold_study(["reach-v3", "push-v3"], episodes=2, radii=(3,)))
@@ -301,7 +307,7 @@ import studies_synthetic as s
 from kerv_cli.lab import work
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import Study
-work.LAPSE_SECONDS, work.BEAT_SECONDS = 1.0, 0.1
+work.LAPSE_SECONDS, work.BEAT_SECONDS = 1.0, 0.3
 work.work(work.Queue(Study(opened(sys.argv[1]), "threshold")), s.stops)
 """
 
@@ -309,27 +315,27 @@ work.work(work.Queue(Study(opened(sys.argv[1]), "threshold")), s.stops)
 def test_a_worker_that_was_stopped_loses_its_block_and_writes_nothing_twice(database, monkeypatch):
     monkeypatch.setattr("kerv_cli.lab.work.LAPSE_SECONDS", 1.0)
     store = waiting(database, STUDY)
+    (stopping,) = (one for one in STUDY.episodes if (one.setting.label, one.seed) == ("ar", 100_002))
     with python(STOPS, database.results) as process:
-        os.waitid(os.P_PID, process.pid, os.WSTOPPED)
+        until(lambda: running(database) == [list(stopping.key)])
         assert 0 < store.counts()[0] < 16
         work(Queue(store), episodes_of)
         assert (store.counts(), queued(database)) == ((16, 16), 0)
         os.kill(process.pid, signal.SIGCONT)
-        assert process.wait(30) == 0
+        process.join(30)
+        assert process.exitcode == 0
     assert episodes(database) == 16
 
 
 CREW = """
 import os
 import sys
-import pandas  # once, before the processes part; so are the calls below
 import studies_synthetic as s
 from kerv_cli.lab import database, work
 from kerv_cli.lab.store import Study
 from kerv_cli.lab.database import Database, opened
 
 work.POLL_SECONDS = 0.01
-work.code_hash(), work.stamp("cpu")
 results, prepare = sys.argv[1], getattr(s, sys.argv[2])
 
 
@@ -375,7 +381,8 @@ for workers in (1, 2, 4):
 def test_any_number_of_workers_run_each_episode_once_though_some_are_killed(database):
     """Each is killed in the seventh episode that it begins. Blocks have 2, 4 and 10 episodes."""
     with python(CREW + MATRIX, database.results, "mortal") as process:
-        assert process.wait(120) == 0
+        process.join(120)
+        assert process.exitcode == 0
     assert (episodes(database), queued(database), errors(database)) == (9 * 10, 0, [])
     for workers in (1, 2, 4):
         for block in (1, 2, 5):
@@ -393,14 +400,16 @@ assert [os.waitpid(child, 0)[1] for child in children] == [0] * 5
 
 def test_two_sweeps_and_three_workers_at_once_run_each_episode_once(database):
     with python(CREW + AT_ONCE, database.results, "brisk") as process:
-        assert process.wait(60) == 0
+        process.join(60)
+        assert process.exitcode == 0
     assert (episodes(database), queued(database)) == (24, 0)
     assert Study(database, "threshold").counts() == (24, 24)
 
 
 def test_sweeps_at_once_run_each_episode_once(database):
     with python(SWEEP, database.results, "unhurried", 1, 4) as process:
-        assert process.wait(60) == 0
+        process.join(60)
+        assert process.exitcode == 0
     assert episodes(database) == 12
     assert Study(database, "threshold").counts() == (12, 12)
     assert queued(database) == 0
@@ -489,7 +498,8 @@ assert crew(Study(opened(results), study.name), 1) == 2
 def test_episodes_whose_order_counts_run_whole_again_when_their_process_dies(database):
     """A setting in which two workers die fails in the block."""
     with python(CREW + IN_ORDER, database.results, "killed_at_the_third") as process:
-        assert process.wait(60) == 0
+        process.join(60)
+        assert process.exitcode == 0
     store = Study(database, "threshold")
     assert store.counts() == (2 + 4, 8)
     assert errors(database) == ["two workers died in this episode\n"] * 2
