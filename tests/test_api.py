@@ -14,6 +14,8 @@ import kerv_cli as kerv
 from kerv_cli.base.config import as_overrides
 from kerv_cli.lab.command import STORE
 
+pytestmark = pytest.mark.usefixtures("quick_report")
+
 ROOT = Path(__file__).resolve().parents[1]
 SHORT: dict[str, Any] = {"task": "reach", "episodes": 1, "record": 0, "world": {"horizon": 6}}
 

@@ -25,6 +25,8 @@ from kerv_cli.engine.cost import READ_PHASES, Profile, Work, prices, read_profil
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.eagle.drafter import DrafterProposer
 
+pytestmark = pytest.mark.usefixtures("quick_report")
+
 NANO = BenchSettings(model="nano", dtype="float32")
 
 Played = tuple[str, int, int, int, str]

@@ -22,6 +22,8 @@ from kerv_cli.base.registry import NoSettings, parts
 from kerv_cli.cli.command import Command
 from kerv_cli.cli.common import one_line_errors
 
+pytestmark = pytest.mark.usefixtures("quick_report")
+
 INVOKE = "from typer.testing import CliRunner; from kerv_cli.cli.app import app; CliRunner().invoke(app, "
 FAST = ["episodes=2", "world.horizon=8", "record=0"]
 
@@ -123,8 +125,8 @@ def test_damaged_weights_are_refused(results):
 def test_no_graphics_gets_the_command_that_brings_them(results):
     words = ("rollout", "task=reach-v3", *FAST, f"results={results}", "policy.target=nano-vision")
     run = process("-m", "kerv_cli", *words, MUJOCO_GL="glfw", DISPLAY="")
+    assert run.returncode == 1, run.stderr
     (line,) = [line for line in run.stderr.splitlines() if line.startswith("kerv: ")]
-    assert run.returncode == 1
     assert "MUJOCO_GL" in line or "apt-get install" in line
 
 

@@ -11,6 +11,8 @@ from command import kerv
 from kerv_cli.base import registry
 from kerv_cli.base.registry import Part
 
+pytestmark = pytest.mark.usefixtures("quick_report")
+
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "tests/examples"
 TABLE = re.compile(r"^\| (.+?) \| (\d) \| (.+?) \| `(.+)` \|$", re.MULTILINE)

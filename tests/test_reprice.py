@@ -21,6 +21,8 @@ from kerv_cli.report.profiles import NamedProfile, open_profiles
 from kerv_cli.report.reprice import own_prices, prices_table, repriced, repriced_summary
 from kerv_cli.report.tables import load_study
 
+pytestmark = pytest.mark.usefixtures("quick_report")
+
 PROFILE = Profile(
     31,
     {
@@ -143,8 +145,7 @@ def test_a_report_prices_the_study_on_the_machines_that_the_study_names(tmp_path
     assert set(pd.read_csv(tmp_path / "report/tables/threshold_on.csv")["on"]) == {"there"}
 
 
-def test_a_report_of_several_studies_prices_each(tmp_path, monkeypatch):
-    monkeypatch.setattr("kerv_cli.report.report.png", lambda *arguments: b"")  # drawing takes longest
+def test_a_report_of_several_studies_prices_each(tmp_path):
     for name in ("first", "second"):
         study = threshold_study(["reach-v3"], episodes=1, radii=(9,), name=name)
         swept(tmp_path, dataclasses.replace(study, machines=("there",)))

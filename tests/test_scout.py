@@ -36,6 +36,8 @@ from kerv_cli.targets.compact.compilable import compile_parts
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.settings import PrepareSettings
 
+pytestmark = pytest.mark.usefixtures("quick_report")
+
 SMALL = ScoutSettings(width=24, rank=4, keypoints=4, cell_width=8, cell_features=2, word_width=4)
 TASK = "drawer-close-v3"
 

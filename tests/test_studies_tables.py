@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import sqlalchemy as sa
-from conftest import refused
+from conftest import refused, without_charts
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
@@ -504,9 +504,10 @@ def commit(monkeypatch):
 
 def test_one_run_of_one_commit_is_published_where_it_is_committed(tmp_path):
     swept(tmp_path, STUDY)
-    draft = files_of(tmp_path)
-    assert not (tmp_path / "tables").exists()
-    published = files_of(tmp_path, publish=True)
+    with without_charts():
+        draft = files_of(tmp_path)
+        assert not (tmp_path / "tables").exists()
+        published = files_of(tmp_path, publish=True)
     table = tmp_path / "tables" / "threshold.csv"
     assert table in published
     assert table.read_bytes() == (tmp_path / "report" / "tables" / "threshold.csv").read_bytes()

@@ -38,6 +38,8 @@ from kerv_cli.serve.settings import ServeSettings
 from kerv_cli.serve.vla_eval import dim_specs
 from kerv_cli.worlds.vla_eval import MetaWorld
 
+pytestmark = pytest.mark.usefixtures("quick_report")
+
 HORIZON = 10
 PARAMS = {"tasks": ["reach"], "seed": 100_000, "horizon": HORIZON}
 
