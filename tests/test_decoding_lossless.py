@@ -11,8 +11,10 @@ from hypothesis import strategies as st
 from mock_target import SEVEN, MockTarget
 from test_acceptance import space_of
 
+from kerv_cli.base.codes import FastCode
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.spaces import ActionSpace, Observation
+from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
@@ -33,14 +35,21 @@ pytestmark = pytest.mark.bits
 ACTIONS, OBSERVATION = SPEC.actions, SPEC.observation
 
 
-def random_target(seed: int, layers: int, heads: int, chunk: int, fixed: bool = False) -> CompactTarget:
+def short_code(chunk: int, dofs: int = ACTIONS.dofs) -> FastCode:
+    """A code of few tokens, so that a random target ends most chunks early."""
+    return FastCode(chunk, dofs, 0.5, ((0, 1), (1, 1), (1, 2)))
+
+
+def random_target(
+    seed: int, layers: int, heads: int, chunk: int, fixed: bool = False, actions: ActionSpace = ACTIONS
+) -> CompactTarget:
     """Odd seeds run on the compiled weights that a shipped policy runs on, even ones on the modules' own path. fixed:
     with caches of fixed shapes, as on CUDA."""
     torch.manual_seed(seed)
     settings = TargetSettings(
         observation="state", width=16 * heads, layers=layers, heads=heads, feed_forward=48, chunk=chunk, scene_tokens=2
     )
-    target = CompactTarget(settings, ACTIONS, OBSERVATION, WordTokenizer.build(["open the drawer"]))
+    target = CompactTarget(settings, actions, OBSERVATION, WordTokenizer.build(["open the drawer"]))
     for parameter in target.trunk.parameters():  # far from initialisation, so that target_tokens depend on the context
         if parameter.dim() == 2:
             torch.nn.init.normal_(parameter, std=0.25)
@@ -60,7 +69,7 @@ def random_prompt(target: CompactTarget, seed: int) -> torch.Tensor:
 
 def size_of(target: Target) -> int:
     """N."""
-    return target.chunk * target.actions.dofs
+    return target.actions.longest(target.chunk)
 
 
 def plain_greedy(target: Target, prompt: torch.Tensor) -> list[int]:
@@ -69,6 +78,8 @@ def plain_greedy(target: Target, prompt: torch.Tensor) -> list[int]:
     for _ in range(size_of(target)):
         hidden = target.forward(x, torch.arange(x.shape[1]))
         tokens.append(int(target.head(hidden[0, -1]).argmax()))
+        if tokens[-1] == target.actions.end:
+            break
         x = torch.cat([x, target.embed(torch.tensor([[tokens[-1]]]))], 1)
     return tokens
 
@@ -94,7 +105,7 @@ class RandomTrees(Proposer):
             candidates = [ROOT, *(i for i, d in enumerate(depths) if d + 1 < depth)]
             parent = int(self.random.choice(candidates))
             level = 0 if parent == ROOT else depths[parent] + 1
-            right = self.random.random() < 0.6
+            right = self.random.random() < 0.6 and level < len(ahead)
             tokens.append(ahead[level] if right else int(self.random.integers(self.vocabulary)))
             parents.append(parent)
             depths.append(level)
@@ -108,7 +119,8 @@ def decode(target: Target, proposer: object, prompt: torch.Tensor) -> Chunk:
 def assert_adds_up(chunk: Chunk) -> None:
     """The record of every decode adds up: forwards, committed tokens, starts."""
     assert chunk.forwards == len(chunk.rounds)
-    assert sum(r.committed for r in chunk.rounds) == chunk.size == len(chunk.tokens)
+    assert sum(r.committed for r in chunk.rounds) == len(chunk.tokens)
+    assert chunk.ended or len(chunk.tokens) == chunk.size
     start = 0
     for r in chunk.rounds:
         assert r.start == start
@@ -116,7 +128,7 @@ def assert_adds_up(chunk: Chunk) -> None:
         start += r.committed
 
 
-@settings(max_examples=50)
+@settings(max_examples=60)
 @given(
     seed=st.integers(0, 10_000),
     layers=st.integers(1, 3),
@@ -125,15 +137,19 @@ def assert_adds_up(chunk: Chunk) -> None:
     nodes=st.integers(0, 30),
     inside=st.booleans(),
     fixed=st.booleans(),
+    coded=st.sampled_from([False, False, True]),
     data=st.data(),
 )
 @pytest.mark.parametrize("name", ["none", "trees", "drafter", "jacobi"])
-def test_strict_decoding_equals_ar(name, seed, layers, heads, chunk, nodes, inside, fixed, data):
-    """docs/methods.md §5: with and without random trees in the prefill, and with every kind of draft after it."""
-    target = random_target(seed, layers, heads, chunk, fixed)
+def test_strict_decoding_equals_ar(name, seed, layers, heads, chunk, nodes, inside, fixed, coded, data):
+    """docs/methods.md §5: with and without random trees in the prefill, and with every kind of draft after it. With a
+    code, chunks end early, and drafts go on after the end token."""
+    actions = dataclasses.replace(ACTIONS, code=short_code(chunk)) if coded else ACTIONS
+    target = random_target(seed, layers, heads, chunk, fixed, actions)
     prompt = random_prompt(target, seed)
     truth = plain_greedy(target, prompt)
-    made = {"none": None, "trees": RandomTrees(truth, seed, nodes), "jacobi": JacobiProposer()}
+    trees = RandomTrees(truth, seed, nodes, actions.tokens)
+    made = {"none": None, "trees": trees, "jacobi": JacobiProposer()}
     if name == "drafter":
         drawn = st.fixed_dictionaries({"layers": st.integers(1, 2), "final_norm": st.booleans()})
         settings = DrafterSettings(**data.draw(drawn, "the drafter"))
@@ -142,13 +158,14 @@ def test_strict_decoding_equals_ar(name, seed, layers, heads, chunk, nodes, insi
             drafter.new_cache = functools.partial(drafter.new_cache, fixed=True)  # type: ignore[method-assign]
         depth, top_k, size = data.draw(st.tuples(st.integers(1, 6), st.integers(1, 5), st.integers(1, 20)), "tree")
         made["drafter"] = DrafterProposer(drafter, target, depth, top_k, size)
-    parts = Parts(prefill_draft=RandomTrees(truth, seed + 1, nodes) if inside else None, proposer=made[name])
+    first = RandomTrees(truth, seed + 1, nodes, actions.tokens) if inside else None
+    parts = Parts(prefill_draft=first, proposer=made[name])
     result = Decoder(target, parts).decode_prompt(prompt)
     assert result.tokens == truth
     assert_adds_up(result)
     assert result.forwards <= size_of(target)
     if name == "none" and not inside:
-        assert result.forwards == size_of(target)
+        assert result.forwards == len(truth)
 
 
 @pytest.mark.parametrize(("where", "most", "committed"), [("proposer", 5, [1, 6, 6, 3]), ("prefill_draft", 16, [16])])
@@ -258,6 +275,25 @@ def test_any_target_is_decoded_losslessly(seed, actions, chunk, words, nodes, in
     result = Decoder(target, Parts(prefill_draft=first, proposer=trees)).decode_prompt(prompt)
     assert result.tokens == truth
     assert_adds_up(result)
+
+
+def test_a_chunk_ends_at_its_end_token_and_a_batch_decodes_the_same():
+    """The record's size is the number of tokens, a shorter one is filled with the code's zeros."""
+    space = dataclasses.replace(SEVEN, code=short_code(2, SEVEN.dofs))
+    target, lengths = MockTarget(space, 2, seed=3), set()
+    decoder = Decoder(target)
+    batch = BatchDecoder(Decoder(target))
+    for number in range(12):
+        shown = Observation(np.array([0.1 * number]), np.zeros(0), "word " * (1 + number % 3))
+        record = decoder.decode(shown)
+        (together,) = batch.decode([batch.new_episode()], [shown])
+        assert together.tokens == record.tokens
+        assert record.actions.shape == (2, 7)
+        assert record.size == len(record.tokens) == record.forwards
+        assert space.end not in record.tokens[:-1]
+        lengths.add(record.size)
+    assert len(lengths) > 1
+    assert min(lengths) < space.longest(2)
 
 
 def test_the_mock_sees_a_wrong_mask_position_or_cache():

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from conftest import refused
 from examples.insertion import SPEC as INSERTION
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kerv_cli.base.codes import FastCode
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace
@@ -157,3 +158,44 @@ def test_seeds_of_one_purpose_are_refused_for_another(seeds, purpose):
     SPEC.seeds.check([100_000, 2_000_000], "evaluation", "seed")
     with pytest.raises(UsageError, match=f"seed {seeds[-1]} "):
         SPEC.seeds.check(seeds, purpose, "demos")
+
+
+@settings(max_examples=60)
+@given(
+    steps=st.integers(1, 16), dofs=st.integers(1, 8), scale=st.sampled_from([1.0, 10.0]), seed=st.integers(0, 10_000)
+)
+def test_a_fast_code_gives_back_every_integer(steps, dofs, scale, seed):
+    """For random merges, random coefficients in its range, and the rounded ones of the largest actions."""
+    rng = np.random.default_rng(seed)
+    plain = FastCode(steps, dofs, scale)
+    count = 2 * plain.highest + 1
+    pairs = {tuple(sorted(pair)) for pair in rng.integers(0, count, (12, 2)).tolist()}
+    code = FastCode(steps, dofs, scale, tuple(sorted(pairs)))
+    random = rng.integers(-plain.highest, plain.highest + 1, (4, steps * dofs)) * (rng.random((4, steps * dofs)) < 0.5)
+    largest = code.coefficients(np.sign(rng.normal(size=(4, steps, dofs))))
+    assert np.abs(largest).max() <= code.highest
+    for row in [*random, *largest, np.zeros(steps * dofs, int)]:
+        tokens = code.encode(row[None])[0]
+        assert tokens.shape == (code.longest,)
+        assert tokens.max() == code.end
+        assert tokens[-1] == code.end
+        found = code.decode(tokens.tolist())
+        assert found + [0] * (len(row) - len(found)) == row.tolist()
+
+
+def test_a_learnt_fast_code_is_shorter_than_bins_and_survives_its_file():
+    """docs/methods.md §0.3. A beginning of a sequence is a coarser motion, and the difference falls with its length."""
+    rng = np.random.default_rng(0)
+    chunks = np.cumsum(rng.normal(0, 0.1, (2000, 8, 4)), 1).clip(-1, 1)
+    space = replace(SPACE, low=(-1.0,) * 4, high=(1.0,) * 4, code=FastCode.learn(chunks))
+    assert read(ActionSpace, json.loads(json.dumps(space.as_dict())), "it") == space
+    tokens = space.chunk_tokens(chunks[:50])
+    assert (tokens != space.end).sum(1).mean() < 20  # bins: 32
+    for row, chunk in zip(tokens.tolist(), chunks, strict=False):
+        whole = row.index(space.end)
+        errors = [np.abs(space.chunk_values(row[:n], 8) - chunk).mean() for n in (1, whole // 2, whole)]
+        assert errors[-1] < 0.05
+        assert errors[2] <= errors[1] <= errors[0] + 0.05
+    assert space.chunk_values(tokens[0].tolist(), 3).shape == (3, 4)
+    with pytest.raises(CheckpointError, match="code"):
+        space.check_same(SPACE, "the drafter", "the target", statistics=True)

@@ -78,6 +78,7 @@ class Part:
             artifact: kinds of artifacts from which it is made.
         colour: Colour in tables and plots, 0xRRGGBB. None: no colour of its own.
         idle: Function of its settings. It returns those without effect, each with the reason.
+        any_code: For a part of a method: whether it works with tokens that have no distance, see `ActionSpace.code`.
         code: The decorated class or function. None: choosing this name means having no such part, as in
             `proposer=none`.
     """
@@ -89,6 +90,7 @@ class Part:
     needs: tuple[str, ...] | Callable[[Any], tuple[str, ...]] = field(default=(), kw_only=True)
     colour: int | None = field(default=None, kw_only=True)
     idle: Callable[[Any], Mapping[str, str]] = field(default=lambda settings: {}, kw_only=True)
+    any_code: bool = field(default=False, kw_only=True)
     code: Any = field(default=None, kw_only=True)
 
     def __call__(self, code: C) -> C:

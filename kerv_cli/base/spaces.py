@@ -4,18 +4,20 @@ An environment has an `ActionSpace` and an `ObservationSpace`. Every artifact th
 drafter, datastore, calibration. Artifacts with different action spaces cannot be used together (`check_same`).
 
 Notation (docs/methods.md §0): D degrees of freedom (DoFs) per control step, H control steps per chunk, N = H · D
-tokens; token j belongs to control step j // D and DoF j % D.
+tokens; token j belongs to control step j // D and DoF j % D. With a code of whole chunks, N is the largest number of
+tokens, and a token belongs to no single step or DoF.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from kerv_cli.base.codes import FastCode
 from kerv_cli.base.errors import CheckpointError, KervError
 
 
@@ -48,6 +50,7 @@ class ActionSpace:
         bins: Number of edges on [-1, 1]. A token is the index of one of the bins - 1 intervals (OpenVLA: 256 edges).
         end_token: Whether there is one more token for the value 1. It decodes to the centre of the last interval.
             Published OpenVLA checkpoints were trained with it.
+        code: A code of whole chunks. None: each number of an action is a token of its own, the index of its bin.
 
     Raises:
         ValueError: The fields contradict each other.
@@ -61,6 +64,7 @@ class ActionSpace:
     high: tuple[float, ...]
     bins: int = 256
     end_token: bool = False
+    code: FastCode | None = None
 
     def __post_init__(self) -> None:
         if not self.names or len(set(self.names)) != len(self.names):
@@ -77,10 +81,11 @@ class ActionSpace:
             raise ValueError(f"bins {self.bins} must be at least 3, control_hz {self.control_hz} above 0")
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the fields as values for JSON. `end_token` is left out if it is false."""
+        """Return the fields as values for JSON. `end_token` and `code` are left out if they are false or None."""
         plain = asdict(self)
-        if not self.end_token:
-            del plain["end_token"]
+        for name in ("end_token", "code"):
+            if not plain[name]:
+                del plain[name]
         return plain
 
     @property
@@ -91,7 +96,12 @@ class ActionSpace:
     @property
     def tokens(self) -> int:
         """Number of different action tokens."""
-        return self.bins - 1 + self.end_token
+        return self.code.tokens if self.code else self.bins - 1 + self.end_token
+
+    @property
+    def end(self) -> int | None:
+        """The token that ends a chunk. None: all chunks of H control steps have the same number of tokens."""
+        return self.code.end if self.code else None
 
     @cached_property
     def edges(self) -> np.ndarray:
@@ -116,8 +126,8 @@ class ActionSpace:
 
     @cached_property
     def is_strict(self) -> np.ndarray:
-        """(D,) bool: which DoFs are strict, that is, their tokens must equal the target's."""
-        return np.array([name in self.strict for name in self.names])
+        """(D,) bool: which DoFs are strict, that is, their tokens must equal the target's. All, with a code."""
+        return np.array([self.code is not None or name in self.strict for name in self.names])
 
     @cached_property
     def bounds(self) -> tuple[tuple[int, int], ...]:
@@ -152,8 +162,12 @@ class ActionSpace:
             stop: Index after the last token. A group that is only partly inside is cut.
 
         Yields:
-            For each group: index of its first token, index after its last, whether all its DoFs are strict.
+            For each group: index of its first token, index after its last, whether all its DoFs are strict. With a code
+            of whole chunks every token is a group.
         """
+        if self.code is not None:  # no token belongs to one DoF
+            yield from ((token, token + 1, False) for token in range(start, stop))
+            return
         while start < stop:
             step, dof = divmod(start, self.dofs)
             first, end = self.bounds[dof]
@@ -191,6 +205,22 @@ class ActionSpace:
         """Return the actions (..., D) in environment units of tokens (..., D): the centres of their bins."""
         return self.unnormalise(self.values_of(tokens))
 
+    def longest(self, steps: int) -> int:
+        """Return N, the largest number of tokens of a chunk of `steps` control steps."""
+        return self.code.longest if self.code else steps * self.dofs
+
+    def chunk_tokens(self, chunks: np.ndarray) -> np.ndarray:
+        """Return the tokens (n, N) int64 of chunks (n, H, D) in environment units. End tokens fill shorter chunks."""
+        if self.code is None:
+            return self.encode(chunks).reshape(len(chunks), -1)
+        return self.code.encode(self.code.coefficients(self.normalise(chunks)))
+
+    def chunk_values(self, tokens: Sequence[int], steps: int) -> np.ndarray:
+        """Return the normalised actions (h, D) of a chunk's tokens: `steps` of them, or fewer if tokens are missing."""
+        if self.code is None:
+            return self.values_of(np.asarray(tokens)).reshape(-1, self.dofs)
+        return self.code.values(self.code.decode(tokens))[:steps]
+
     def fitted(self, actions: np.ndarray) -> ActionSpace:
         """Return this space with the 1st and 99th percentile of actions (n, D) as its limits."""
         low, high = action_limits(*np.percentile(actions, [1, 99], axis=0))
@@ -209,7 +239,7 @@ class ActionSpace:
         Raises:
             CheckpointError: The spaces differ. The message names the first difference.
         """
-        normalisation = ("low", "high", "end_token") if statistics else ()
+        normalisation = ("low", "high", "end_token", "code") if statistics else ()
         for name in ("names", "groups", "strict", "bins", "control_hz", *normalisation):
             mine, theirs = getattr(self, name), getattr(other, name)
             if mine != theirs:

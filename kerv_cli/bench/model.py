@@ -73,7 +73,7 @@ class Model:
     @property
     def size(self) -> int:
         """N, number of tokens in a chunk."""
-        return int(self.target.chunk * self.target.actions.dofs)
+        return int(self.target.actions.longest(self.target.chunk))
 
     @property
     def dtype(self) -> torch.dtype:

@@ -145,6 +145,10 @@ class DistanceRule(Buildable):
         """
         return accept_by_distance(tree, target_tokens, start, self.limits(r))
 
+    def judge_after(self, tokens: Sequence[int], tree: TokenTree, target_tokens: Sequence[int], r: int) -> Accepted:
+        """Return what `judge` returns. A rule that also reads the committed `tokens` overrides this."""
+        return self.judge(tree, target_tokens, len(tokens), r)
+
 
 class StrictRule(DistanceRule):
     """Accepts only draft tokens that equal the target's. Decoding is then lossless."""

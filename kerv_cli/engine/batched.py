@@ -58,7 +58,7 @@ class BatchDecoder:
             chunks.append(chunk)
         verified = [chunk for chunk in chunks if chunk.remaining]
         for chunk, tokens in zip(verified, self._tokens(verified), strict=True):
-            for token in tokens:
+            for token in chunk.until_end(tokens):
                 chunk.commit_token(token)
         similarity = self.decoder.parts.similarity
         return [chunk.record(chunk.actions(), math.nan, dict(UNTIMED), similarity(chunk)) for chunk in chunks]
@@ -87,7 +87,7 @@ class BatchDecoder:
 
     @property
     def _size(self) -> int:
-        return self.decoder.steps * self.target.actions.dofs
+        return self.target.actions.longest(self.decoder.steps)
 
     def _cache(self, rows: int) -> Cache:
         """Return an empty cache for `rows` sequences.
@@ -115,7 +115,7 @@ def greedy(target: Target, prompt: Tensor, cache: Cache | None = None, size: int
         The N most probable tokens of each prompt, (B, N). And the hidden states (B, P + N − 1, E) of the prompt and of
         all tokens but the last.
     """
-    length, size = prompt.shape[1], size or target.chunk * target.actions.dofs
+    length, size = prompt.shape[1], size or target.actions.longest(target.chunk)
     cache = cache or target.new_cache(len(prompt), length + size)
     positions = torch.arange(length + size - 1, device=prompt.device)
     hidden = [target.forward(prompt, positions[:length], cache)]

@@ -71,11 +71,13 @@ class Situation:
         task: Name of the task.
         history: The last executed actions.
         path: Measured positions of the end effector, (3,) each, metres, oldest first.
+        last: Tokens of the chunk that was decoded last.
     """
 
     task: str
     history: ActionHistory
     path: list[np.ndarray] = field(default_factory=list)
+    last: list[int] = field(default_factory=list)
 
 
 class Follower:
@@ -194,13 +196,20 @@ class Chunk:
 
     @property
     def size(self) -> int:
-        """Number of tokens N in the complete chunk."""
-        return self.steps * self.space.dofs
+        """Number of tokens N in the complete chunk. It is the largest number if an end token can end the chunk."""
+        longest = self.space.longest(self.steps)
+        most = self.choice.most if self.choice is not None else None
+        return longest if most is None else min(longest, most)
+
+    @property
+    def ended(self) -> bool:
+        """Whether an end token, or a rectifier's prediction, ended the chunk before it had N tokens."""
+        return self.closed is not None or (bool(self.tokens) and self.tokens[-1] == self.space.end)
 
     @property
     def remaining(self) -> int:
-        """Number of tokens still to be decoded. 0 if a rectifier's prediction ended the chunk early."""
-        return 0 if self.closed is not None else self.size - len(self.tokens)
+        """Number of tokens still to be decoded, at most. 0 if the chunk has ended."""
+        return 0 if self.ended else self.size - len(self.tokens)
 
     @property
     def compensated(self) -> int:
@@ -279,9 +288,15 @@ class Chunk:
             self.commit(Round(PARALLEL, target_tokens=tuple(tokens), committed=self.size), tokens)
             return
         check_tokens(np.asarray(tokens), self.space.tokens, proposer)
-        self.tokens = list(tokens[: self.size])
+        self.tokens = self.until_end(tokens[: self.size])
         drafted = tuple(self.tokens)
-        self.rounds.append(Round("skip", proposer, drafted=drafted, accepted=self.size, committed=self.size))
+        size = len(drafted)
+        self.rounds.append(Round("skip", proposer, drafted=drafted, accepted=size, committed=size))
+
+    def until_end(self, tokens: Sequence[int]) -> list[int]:
+        """Return the tokens up to the first end token, or all if there is none."""
+        found = list(tokens)
+        return found[: found.index(self.space.end) + 1] if self.space.end in found else found
 
     def rectify(self, found: Rectified, with_target_token: bool) -> None:
         """Commit the values that a rectifier predicted.
@@ -307,9 +322,9 @@ class Chunk:
         """Return the actions (steps, D) of the complete chunk, float32, environment units."""
         values = self.closed
         if values is None:
-            values = self.space.values_of(np.array(self.tokens))
-            values[list(self.filled)] = list(self.filled.values())
-        return self.space.unnormalise(values.reshape(-1, self.dofs)).astype(np.float32)
+            values = self.space.chunk_values(self.tokens, self.steps)
+            values.flat[list(self.filled)] = list(self.filled.values())
+        return self.space.unnormalise(values).astype(np.float32)
 
     def record(
         self, actions: np.ndarray, seconds: float, phases: dict[str, float], similarity: float | None = None
@@ -318,7 +333,7 @@ class Chunk:
         return DecodeRecord(
             tokens=tuple(self.tokens),
             actions=actions,
-            size=self.size,
+            size=len(self.tokens) if self.space.end is not None else self.size,
             forwards=self.forwards,
             rounds=tuple(self.rounds),
             mode=next(filter(None, (one.drafter for one in self.rounds)), "ar"),

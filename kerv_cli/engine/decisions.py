@@ -17,6 +17,7 @@ class Choice:
 
     mode: str  # the proposer's name
     metric: float | None = None  # F (docs/methods.md §4.4); None if the decision does not use it
+    most: int | None = None  # largest number of tokens to decode; None: the whole chunk
 
 
 class Rectified(NamedTuple):

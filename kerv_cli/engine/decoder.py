@@ -93,7 +93,7 @@ class Decoder(ActionDecoder):
         self.steps = chunk_steps(chunk, target.chunk)
         self.acceptance: DistanceRule = self.parts.acceptance or StrictRule(target.actions)
         self.threshold: Threshold = self.parts.threshold or Fixed(0)
-        size = self.steps * target.actions.dofs
+        size = target.actions.longest(self.steps)
         proposers = filter(None, (self.parts.prefill_draft, self.parts.proposer))
         nodes = max(size, *(proposer.nodes for proposer in proposers), 0)
         self.cache = target.new_cache(1, target.max_prompt + size + nodes + 1)
@@ -139,6 +139,7 @@ class Decoder(ActionDecoder):
         stopwatch = Stopwatch(self.target.device)
         chunk = self.decode_prompt(self._encoding(observation, stopwatch), stopwatch, observation)
         actions = chunk.actions()
+        self.situation.last[:] = chunk.tokens
         # a plugin's threshold need not have the attribute `measure`
         measure = getattr(self.threshold, "measure", MEAN)
         self.threshold.update(variability(chunk.rounds, self.space, measure))
@@ -231,7 +232,9 @@ class Decoder(ActionDecoder):
         """
         tokens = None
         if isinstance(self.target, ContinuesGreedily):
-            tokens = self.target.continue_greedily(chunk.tokens[-1], chunk.remaining, chunk.target.cache)
+            tokens = self.target.continue_greedily(
+                chunk.tokens[-1], chunk.remaining, chunk.target.cache, self.space.end
+            )
         tokens = self.forward_singly(chunk, stopwatch) if tokens is None else tokens
         stopwatch.lap("verify")
         for token in tokens:
@@ -242,7 +245,7 @@ class Decoder(ActionDecoder):
         """Decode the remaining tokens with one forward each, and return them.
 
         Each token stays on the device as the input of the next forward. The CPU reads all tokens after the last
-        forward.
+        forward. Only if an end token can end the chunk, it reads each of them at once.
         """
         target, cache = self.target, chunk.target.cache
         first = cache.length
@@ -252,6 +255,8 @@ class Decoder(ActionDecoder):
             hidden = target.forward(target.embed(tokens[-1][None]), position, cache)
             tokens.append(target.head(hidden)[0].argmax(-1))
             stopwatch.lap("verify")
+            if self.space.end is not None and int(tokens[-1]) == self.space.end:
+                break
         return torch.cat(tokens[1:]).tolist()
 
     def propose(self, chunk: Chunk, proposer: Proposer | None, stopwatch: Stopwatch) -> Draft:
@@ -265,7 +270,7 @@ class Decoder(ActionDecoder):
         if proposer is None or chunk.remaining < 2:
             return EMPTY
         depth = chunk.remaining - 1
-        draft = proposer.propose(chunk, depth)
+        draft = proposer.propose(chunk, depth).until(self.space.end)
         draft.check(self.space.tokens, proposer.name, depth)
         stopwatch.lap("propose")
         return draft
@@ -298,7 +303,9 @@ class Decoder(ActionDecoder):
         if proposer is None:
             return Accepted((), None)
         rule, r = self.acceptance.of_drafts_from(proposer.name), self.threshold.radius()
-        return rule.judge(verified.tree, verified.target_tokens, len(chunk.tokens), r)
+        path, rejected = rule.judge_after(chunk.tokens, verified.tree, verified.target_tokens, r)
+        kept = chunk.until_end([verified.tree.tokens[node] for node in path])
+        return Accepted(path[: len(kept)], rejected if len(kept) == len(path) else None)
 
     def commit(self, chunk: Chunk, verified: Verified, accepted: Accepted, proposer: Proposer | None) -> Tensor:
         """Commit the accepted path and, if the chunk has room, the bonus: the target's next token.
@@ -313,7 +320,8 @@ class Decoder(ActionDecoder):
             return self._keep(chunk, verified, [])
         start, nodes = len(chunk.tokens), path if rejected is None else (*path, rejected)
         after_rejection = [] if rejected is None else tree.down_from(rejected)
-        bonus = [target_tokens[path[-1] + 1 if path else 0]] if start + len(path) < chunk.size else []
+        is_full = start + len(path) == chunk.size or (bool(path) and tree.tokens[path[-1]] == self.space.end)
+        bonus = [] if is_full else [target_tokens[path[-1] + 1 if path else 0]]
         targets = [target_tokens[tree.parents[node] + 1] for node in nodes]
         record = Round(
             mode="verify",

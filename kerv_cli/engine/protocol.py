@@ -110,13 +110,14 @@ class EncodesMany(Protocol):
 class ContinuesGreedily(Protocol):
     """A target that can decode several tokens autoregressively in a single, faster call."""
 
-    def continue_greedily(self, token: int, count: int, cache: Any) -> list[int] | None:
+    def continue_greedily(self, token: int, count: int, cache: Any, end: int | None = None) -> list[int] | None:
         """Decode `count` tokens greedily. The cache then holds the same tokens as after `count` single forwards.
 
         Args:
             token: The last committed token. It is not in the cache yet.
             count: Number of tokens to decode.
             cache: Holds all tokens before `token`.
+            end: Token after which to stop. None: decode all `count` tokens.
 
         Returns:
             The decoded tokens. None if the target, as it was loaded, cannot decode them in one call.

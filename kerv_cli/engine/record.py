@@ -168,8 +168,10 @@ def variability(rounds: Sequence[Round], space: ActionSpace, measure: Measure = 
         measure: Which tokens count, and whether their differences are added or averaged.
 
     Returns:
-        K in normalised action units. None if no draft token counts.
+        K in normalised action units. None if no draft token counts, or if tokens have no distance.
     """
+    if space.code is not None:
+        return None
     differences: list[float] = []
     for one in rounds:
         count = one.accepted if measure.accepted else len(one.drafted)

@@ -7,6 +7,8 @@
     contact                     ours: a threshold that shrinks near the object
     heisd                       HeiSD: retrieved drafts, a boundary between two drafters, skipped verification
     jacobi, parallel            decoding as in PD-VLA and in OpenVLA-OFT
+    lookup                      prompt lookup in the last chunk's tokens
+    motion                      ours: acceptance and stopping by the motion that a code of a whole chunk stands for
     early, merged               ours: drafts from the prompt, before the prefill (`method=one_pass`)
     scout                       ours: a drafter with its own vision encoder
     streak                      ours: drafts that are executed without verification
@@ -29,4 +31,4 @@ from __future__ import annotations
 # importing a family registers its parts; this is their order in error messages and help texts
 # isort: off
 from kerv_cli.methods import ar, spec_vla, eagle, early, scout, calibrated, kerv, parallel, streak  # noqa: F401
-from kerv_cli.methods import sp_vla, contact, heisd, jacobi, merged, certified  # noqa: F401
+from kerv_cli.methods import sp_vla, contact, heisd, jacobi, lookup, merged, motion, certified  # noqa: F401

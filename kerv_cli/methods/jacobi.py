@@ -26,7 +26,7 @@ class JacobiProposerSettings:
 
 
 # without `chains`, because its first guess is made only after the prefill
-@ProposerPart("jacobi", JacobiProposerSettings, colour=0x8A7FD4, when=STATES)
+@ProposerPart("jacobi", JacobiProposerSettings, colour=0x8A7FD4, when=STATES, any_code=True)
 class JacobiProposer(ChainProposer):
     """Guesses the remaining tokens of a chunk. After each forward, the target's tokens become the next guess.
 

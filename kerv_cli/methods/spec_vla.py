@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from kerv_cli.methods.context import Context
 
 
-AcceptancePart("strict", reads_threshold=False)(StrictRule)
+AcceptancePart("strict", reads_threshold=False, any_code=True)(StrictRule)
 
 
 @dataclass
@@ -57,4 +57,4 @@ class FixedThresholdSettings:
     r: int = number(9, 0, MOST_BINS)  # largest accepted distance to the target's token, bins
 
 
-ThresholdPart("fixed", FixedThresholdSettings, batchable=True)(Fixed)
+ThresholdPart("fixed", FixedThresholdSettings, batchable=True, any_code=True)(Fixed)

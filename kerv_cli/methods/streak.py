@@ -97,7 +97,7 @@ class StreakSkip(Skip):
         return tolerance > 0 and chunk.distance(self.chain[: len(targets)], targets) <= tolerance
 
 
-@SkipPart("always", takes_draft=True, verifies=False, batchable=True)
+@SkipPart("always", takes_draft=True, verifies=False, batchable=True, any_code=True)
 class AlwaysSkip(Skip):
     """Executes every draft without verification. If there is no draft of a whole chunk, the target decodes."""
 

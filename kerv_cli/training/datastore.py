@@ -158,7 +158,7 @@ def entries_of(target: Any, episode: DemoEpisode, space: ObservationSpace, key: 
         expert's next H undisturbed actions.
     """
     steps = observed_steps(episode, bool(target.cameras))
-    tokens = target.actions.encode(read_chunks(episode, steps, target.chunk)).reshape(len(steps), -1)
+    tokens = target.actions.chunk_tokens(read_chunks(episode, steps, target.chunk))
     observations = observations_of(target, episode, steps, space)
     size = -(-len(steps) // -(-len(steps) // BATCH))  # equal batches
     keys = [prompt_key(prompt, target, key).cpu().numpy() for prompt in prompts_of(target, observations, size)]

@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
+from kerv_cli.base.codes import FastCode
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ActionSpace, Place
 from kerv_cli.targets.checkpoint import TargetDescription
@@ -186,14 +187,19 @@ class Imitation:
     ) -> None:
         self.module, self.settings, self.device, self.closed_loop = target, settings, target.device, closed_loop
         self.training, self.held_out = split(samples, settings.held_out)
-        self.labels = soft_labels(target.actions.tokens, settings.label_sigma).to(self.device)
+        sigma = settings.label_sigma if target.actions.code is None else 0.0
+        self.labels = soft_labels(target.actions.tokens, sigma).to(self.device)
         self.weights = task_weights(self.training.tasks, settings.balance)
         self.learns_places = bool(target.cameras and settings.scene_weight)
 
     def tokens(self, batch: Samples) -> Tensor:
-        """Return the action tokens (B, N) int64 of B samples, on the target's device."""
-        encoded = self.module.actions.encode(batch.chunks.numpy())
-        return torch.from_numpy(encoded).flatten(1).to(self.device)
+        """Return the action tokens (B, n) int64 of B samples, on the target's device.
+
+        n is N, or less if an end token ends all chunks before.
+        """
+        tokens = self.module.actions.chunk_tokens(batch.chunks.numpy())
+        lengths = (tokens != self.module.actions.end).sum(1) + 1
+        return torch.from_numpy(tokens[:, : lengths.max()]).to(self.device)
 
     @contextlib.contextmanager
     def precision(self) -> Iterator[None]:
@@ -258,8 +264,9 @@ class Imitation:
             logits, positions = module.teacher_forced(batch.inputs(self.device), tokens)
             guess = logits.argmax(-1)
             distances.append((guess - tokens).abs().flatten())
-            gap = np.abs(actions.values_of(guess.cpu().numpy()) - actions.values_of(tokens.cpu().numpy()))
-            gaps.append(gap.reshape(-1, actions.dofs))
+            for rows in zip(guess.tolist(), tokens.tolist(), strict=True):
+                guessed, expert = (actions.chunk_values(row, module.chunk) for row in rows)
+                gaps.append(np.abs(guessed - expert))
             offsets.append((positions - batch.places.to(self.device)).norm(dim=-1))
         distance, error = torch.cat(distances), np.concatenate(gaps).mean(0)
         metrics = {
@@ -286,8 +293,8 @@ class Imitation:
 def check_init(settings: TargetSettings, camera: str, description: TargetDescription, folder: Path) -> None:
     """Refuse initial weights whose shapes differ from the new target's.
 
-    Only the settings `size`, `chunk`, `norm` and `parallel` may differ. The new target may see further views after the
-    old ones.
+    Only the settings `size`, `chunk`, `code`, `norm` and `parallel` may differ. The new target may see further views
+    after the old ones.
 
     Args:
         settings: Shapes of the new target.
@@ -300,7 +307,7 @@ def check_init(settings: TargetSettings, camera: str, description: TargetDescrip
     """
     for name, value in asdict(settings).items():
         stored = description.settings.get(name)
-        if name not in ("size", "chunk", "parallel", "norm") and stored != value:
+        if name not in ("size", "chunk", "code", "parallel", "norm") and stored != value:
             raise UsageError(
                 f"train.init: the target in {folder} has {name}={stored}, the run target.{name}={value}: set both alike"
             )
@@ -312,22 +319,26 @@ def check_init(settings: TargetSettings, camera: str, description: TargetDescrip
         )
 
 
-def continued_target(settings: TargetSettings, init: CompactTarget, camera: str) -> CompactTarget:
+def continued_target(
+    settings: TargetSettings, init: CompactTarget, camera: str, code: FastCode | None
+) -> CompactTarget:
     """Make a target that starts from the weights, action statistics and words of another target.
 
-    Only the query embeddings of a parallel target are newly initialised. The encoder of an added view is a copy of the
-    first view's. The weights from an added view to the estimated object positions start at zero.
+    Only the query embeddings of a parallel target are newly initialised, and embedding and head if the tokens differ.
+    The encoder of an added view is a copy of the first view's. The weights from an added view to the estimated object
+    positions start at zero.
 
     Args:
         settings: Shapes of the new target.
         init: The target with the initial weights.
         camera: Camera of the new target. Several views are joined by `+`.
+        code: Code of the new target's chunks. None: a token for every number.
     """
-    target = CompactTarget(replace(settings), init.actions, init.observation, init.words, camera)
+    actions = replace(init.actions, code=code)
+    target = CompactTarget(replace(settings), actions, init.observation, init.words, camera)
     new, old = target.state_dict(), init.state_dict()
-    weights = {name: old[name] for name in old.keys() & new.keys()}
-    if "queries" in new:
-        weights.setdefault("queries", new["queries"])
+    kept = old.keys() if actions == init.actions else old.keys() - {"embedding.weight", "head.weight"}
+    weights = new | {name: old[name] for name in kept & new.keys()}
     if target.cameras:
         for view in range(len(init.encoders) - 1, len(target.encoders) - 1):
             weights |= {f"further_views.{view}.{k}": v for k, v in init.vision.state_dict().items()}

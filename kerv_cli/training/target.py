@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from kerv_cli.base.codes import CODES
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.paths import artifact, find_target
@@ -202,11 +203,15 @@ def load_training(
         observation = observation.without_state(WAYPOINTS)
     waypoints = len(observation.places) if settings.train.places == "path" else 0
     samples = load_samples(dataset, shapes, words, tasks, progress, waypoints)
-    if old is not None:
-        return continued_target(shapes, old, camera), samples
     torch.manual_seed(settings.train.seed)
-    actions = manifest.actions.fitted(samples.chunks[:, 0].numpy().astype(np.float64))
-    return CompactTarget(replace(shapes), actions, observation, words, camera), samples
+    if old is not None:
+        actions = old.actions
+    else:
+        actions = manifest.actions.fitted(samples.chunks[:, 0].numpy().astype(np.float64))
+    code = CODES[shapes.code](actions.normalise(samples.chunks.numpy()))
+    if old is not None:
+        return continued_target(shapes, old, camera, code), samples
+    return CompactTarget(replace(shapes), replace(actions, code=code), observation, words, camera), samples
 
 
 def state_range(dataset: DemoDataset) -> list[list[float]]:

@@ -48,6 +48,7 @@ def only_of_trees(settings: DrafterProposerSettings, *names: str) -> dict[str, s
     colour=0x56B4E9,
     when=STATES,
     cost=DRAFTING,
+    any_code=True,
     idle=lambda settings: only_of_trees(settings, "top_k", "nodes"),
 )
 def artifact() -> type:

@@ -126,7 +126,7 @@ class DrafterProposer(Proposer):
     ) -> None:
         self.drafter, self.target = drafter, target
         self.depth, self.top_k, self.nodes = depth, min(top_k, target.actions.tokens), nodes
-        capacity = target.max_prompt + target.chunk * target.actions.dofs + top_k * depth
+        capacity = target.max_prompt + target.actions.longest(target.chunk) + top_k * depth
         self.cache, self.hidden = drafter.new_cache(1, capacity), torch.empty(0)
         self.compiled = drafter.joined(target, top_k > 1) if isinstance(drafter, EagleNetwork) else None
 

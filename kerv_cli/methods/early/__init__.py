@@ -28,6 +28,7 @@ class EarlySettings:
     drafts_whole_chunk=True,
     cost="early",
     measured_by="early_unverified",
+    any_code=True,
 )
 def artifact() -> type:
     """Import and return the class that trains and loads the artifact `early`, the early drafter."""

@@ -68,7 +68,7 @@ class EarlyNetwork(Compilable):
     def __init__(self, settings: EarlySettings, actions: ActionSpace, chunk: int, features: int) -> None:
         super().__init__()
         self.settings, self.actions, self.chunk = settings, actions, chunk
-        self.tokens = chunk * actions.dofs
+        self.tokens = actions.longest(chunk)
         # the prompt's features differ in size by orders of magnitude
         self.register_buffer("mean", torch.zeros(features))
         self.register_buffer("scale", torch.ones(features))
@@ -268,7 +268,8 @@ class EarlyDrafter(TrainableDrafter):
             batch: The B training examples.
             settings: Settings of `kerv train drafter`.
         """
-        labels = _labels(target.actions.tokens, settings.train.label_sigma, target.device)
+        sigma = settings.train.label_sigma if target.actions.code is None else 0.0
+        labels = _labels(target.actions.tokens, sigma, target.device)
         return token_loss(logits, batch.tokens.to(target.device), labels)
 
     def loss(self, network: Any, target: Any, batch: Any, step: int, settings: Any) -> tuple[Tensor, Metrics]:

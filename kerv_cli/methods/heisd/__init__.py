@@ -99,6 +99,7 @@ class RetrievalProposerSettings:
     looks_up=True,
     cost="retrieval",
     measured_by="retrieval_unverified",
+    any_code=True,
 )
 class RetrievalProposer(ChainProposer):
     """Drafts the task's most similar stored chunks, merged into one tree (docs/methods.md §4.2).

@@ -232,7 +232,7 @@ class Datastore:
             UsageError: The search is unknown or cannot be used.
         """
         manifest = DatastoreArtifact().checked(folder, description)
-        rows, size = manifest.rows, manifest.chunk * manifest.actions.dofs
+        rows, size = manifest.rows, manifest.actions.longest(manifest.chunk)
         try:
             vectors = np.load(folder / VECTORS).astype(np.float32, copy=False)
             projection = np.load(folder / PROJECTION) if PROJECTION in manifest.files else None

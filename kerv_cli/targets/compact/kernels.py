@@ -472,11 +472,14 @@ def branch(frames, columns, time, start, mask, results):
 _F, _I = types.float32, types.int64
 _TABLES = _I[:, ::1], _I, _I, _I, _I[::1], _F[::1]
 _COPIES = _F[:, :, :, :, ::1], _F[:, :, :, :, ::1], _I
-SIGNATURE = types.void(*_TABLES, _F[:, ::1], _I[::1], _I, _F[:, :, :, :, :, ::1], *_COPIES, _F[:, ::1], _F[:, :, ::1])
+_ALL = _F[:, ::1], _I[::1], _I, _F[:, :, :, :, :, ::1], *_COPIES, _F[:, ::1], _F[:, :, ::1], _I
+SIGNATURE = types.void(*_TABLES, *_ALL)
 
 
 @numba.njit(SIGNATURE, error_model="numpy", fastmath=FAST, cache=True)
-def run(ops, begin, end, last, indices, numbers, frames, positions, start, cache, keys, values, filled, mask, results):
+def run(
+    ops, begin, end, last, indices, numbers, frames, positions, start, cache, keys, values, filled, mask, results, stop
+):
     """Execute a table of operations on all frames, from the `begin`-th time to the `end`-th.
 
     After each execution the rotary positions grow by one, and the number of cached tokens by T.
@@ -498,6 +501,7 @@ def run(ops, begin, end, last, indices, numbers, frames, positions, start, cache
         mask: (T, start + T · times), 0 for slots that a row sees. Shape (0, 1) means that attention is causal.
         results: (times, 1, B · T), filled with the result of ARGMAX in each execution. For programs that draft a tree
             (times, 4, k²), filled by `branch`.
+        stop: Result of the first row after which to stop. Negative: execute the table until `end`.
     """
     rows, size = frames.shape
     tokens, memory, channels = len(positions), frames.ctypes.data, cache.shape[5]
@@ -535,6 +539,8 @@ def run(ops, begin, end, last, indices, numbers, frames, positions, start, cache
                     elementwise(code, frames[r], columns, numbers, indices)
                     if code == op.ARGMAX:
                         results[time, 0, r] = frames[r, out]
+        if stop >= 0 and results[time, 0, 0] == stop:
+            break
 
 
 @numba.njit(

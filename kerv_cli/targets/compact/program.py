@@ -147,6 +147,7 @@ def forget(module: torch.nn.Module) -> None:
 
 
 _WITHOUT_ATTENTION = Cache(1, 1, 1, 1, 1, torch.empty(0))
+NOTHING = -1  # no result, or no token that ends a repetition
 
 
 class Program:
@@ -215,7 +216,7 @@ class Program:
             found.append(torch.from_numpy(np.ascontiguousarray(block)).view(-1, *shape))
         return found
 
-    def repeat(self, times: int, *inputs: Tensor, cache: Cache) -> np.ndarray:
+    def repeat(self, times: int, *inputs: Tensor, cache: Cache, end: int | None = None) -> np.ndarray:
         """Execute the program several times in one call. The outputs of one execution are the inputs of the next.
 
         Args:
@@ -223,13 +224,14 @@ class Program:
             inputs: Inputs of the first execution, one token of each of B sequences.
             cache: Keys and values of earlier tokens. Each execution appends the keys and values of one more token, but
                 `cache.length` stays as it is.
+            end: Result of the first sequence after which to stop. None: execute the program `times` times.
 
         Returns:
-            (times, B) float32, the result of the ARGMAX operation in each execution.
+            (executions, B) float32, the result of the ARGMAX operation in each execution.
         """
-        results = np.empty((times, 1, inputs[0].numel() // self.places[0][1]), np.float32)
-        self._execute(inputs, torch.tensor([cache.length]), cache, None, results)
-        return results[:, 0]
+        results = np.full((times, 1, inputs[0].numel() // self.places[0][1]), NOTHING, np.float32)
+        self._execute(inputs, torch.tensor([cache.length]), cache, None, results, end)
+        return results[: _executed(results), 0]
 
     def grow(
         self, levels: int, top_k: int, nodes: int, *inputs: Tensor, position: int, cache: Cache
@@ -267,8 +269,12 @@ class Program:
         cache: Cache | None,
         mask: Tensor | None,
         results: np.ndarray | None = None,
+        end: int | None = None,
     ) -> np.ndarray:
-        """Execute the program len(results) times, or once without results. Return the frames (rows, size)."""
+        """Execute the program len(results) times, or once without results. Return the frames (rows, size).
+
+        With `end`, stop after the execution whose result it is.
+        """
         where = np.zeros(1, np.int64) if positions is None else positions.numpy()
         rows, tokens = inputs[0].numel() // self.places[0][1], len(where)
         results = np.empty((1, 1, rows), np.float32) if results is None else results
@@ -286,14 +292,15 @@ class Program:
         keys, values, filled = cache.copies(PANEL)
         seen = np.zeros((0, 1), np.float32) if mask is None else mask.float().numpy()
         rest = frames, where, start, buffer, keys, values, filled, seen, results
+        stop_at = NOTHING if end is None else end
         if self.blocked:
-            self._alternate(times, *rest)
+            self._alternate(times, stop_at, *rest)
         else:
-            self.run(self.ops, 0, times, self.last, self.indices, self.numbers, *rest)
-        cache.copied = stop
+            self.run(self.ops, 0, times, self.last, self.indices, self.numbers, *rest, stop_at)
+        cache.copied = stop if end is None else start + tokens * _executed(results)
         return frames
 
-    def _alternate(self, times: int, frames: np.ndarray, *rest: Any) -> None:
+    def _alternate(self, times: int, end: int, frames: np.ndarray, *rest: Any) -> None:
         """Execute the program if oneDNN multiplies some of the matrices: a compiled call from each to the next."""
         memory, run = torch.from_numpy(frames), self.run
         where, start, buffer, keys, values, filled, seen, results = rest
@@ -303,11 +310,18 @@ class Program:
             rest = frames, where, start, buffer, keys, values, held, seen, results
             for i, matrix, rows in self.blocked:
                 if i < stop:
-                    run(self.ops[begin:i], time, time + 1, i - begin, self.indices, self.numbers, *rest)
+                    run(self.ops[begin:i], time, time + 1, i - begin, self.indices, self.numbers, *rest, NOTHING)
                     for given, result in rows:
                         memory[:, result] = matrix(memory[:, given])
                     begin = i + 1
-            run(self.ops[begin:stop], time, time + 1, stop - begin, self.indices, self.numbers, *rest)
+            run(self.ops[begin:stop], time, time + 1, stop - begin, self.indices, self.numbers, *rest, NOTHING)
+            if end != NOTHING and results[time, 0, 0] == end:
+                return
+
+
+def _executed(results: np.ndarray) -> int:
+    """Return how many executions have a result, of results (times, 1, B)."""
+    return int((results[:, 0, 0] != NOTHING).sum())
 
 
 def _columns_of(op: dict[str, Any], row: int) -> tuple[slice, slice]:

@@ -21,6 +21,7 @@ class TargetSettings:
     heads: int = number(6, 1, 1024, help="attention heads")
     feed_forward: int = number(512, 1, 262_144, help="hidden units of a layer's feed-forward part")
     chunk: int = number(4, 1, 1024, help="H, control steps per decode")
+    code: str = choice("bins", "bins", "fast", help="tokens: a bin per number, or a FAST code of the whole chunk")
     grid: int = number(4, 1, 512, help="vision tokens per side")
     keypoints: int = number(32, 1, 4096, help="points that the vision encoder finds in an image (spatial soft-argmax)")
     channels: int = number(24, 1, 4096, help="width of the vision encoder's first stage")

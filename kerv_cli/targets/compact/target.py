@@ -144,7 +144,7 @@ class CompactTarget(Compilable):
         self.head = CompilableLinear(s.width, actions.tokens, bias=False)
         nn.init.normal_(self.head.weight, std=0.02)
         if s.parallel:
-            queries = self.embedding.weight.data.mean(0).repeat(s.chunk * actions.dofs, 1)
+            queries = self.embedding.weight.data.mean(0).repeat(actions.longest(s.chunk), 1)
             self.queries = nn.Parameter(queries + 0.02 * torch.randn_like(queries))
 
     @property
@@ -356,21 +356,22 @@ class CompactTarget(Compilable):
         """Return the hidden states (B, T, E) of embeddings x (B, T, E). `Trunk.forward` explains the arguments."""
         return self.trunk(x, positions, cache, seen)
 
-    def continue_greedily(self, token: int, count: int, cache: Cache) -> list[int] | None:
+    def continue_greedily(self, token: int, count: int, cache: Cache, end: int | None = None) -> list[int] | None:
         """Decode the next `count` tokens greedily in one compiled call.
 
         Args:
             token: The last token, not yet in the cache.
             count: Number of tokens to decode.
-            cache: Keys and values of all tokens before `token`. It grows by `count` tokens.
+            cache: Keys and values of all tokens before `token`. It grows by the number of decoded tokens.
+            end: Token after which to stop. None: decode all `count` tokens.
 
         Returns:
             The tokens. None if this target is not compiled.
         """
         if self.compiled is None or cache.fixed:
             return None
-        tokens = self.compiled.step.repeat(count, torch.tensor([[token]]), cache=cache)
-        cache.length += count
+        tokens = self.compiled.step.repeat(count, torch.tensor([[token]]), cache=cache, end=end)
+        cache.length += len(tokens)
         return [int(token) for token in tokens[:, 0]]
 
     def predict(

@@ -1,0 +1,152 @@
+"""Codes of whole chunks: sequences of tokens that stand for all actions of a chunk together (docs/methods.md §0.3).
+
+Notation: D degrees of freedom (DoFs), H control steps of a chunk, V tokens of the vocabulary.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+SCALE = 10.0
+"""Factor by which coefficients are multiplied before rounding (FAST §4.3)."""
+VOCABULARY = 256
+"""Number of tokens. FAST has 1,024, for longer chunks of more DoFs."""
+FIRST = 0x4E00
+"""Code point of the character that stands for token 0 while merges are learnt or applied."""
+
+
+@dataclass(frozen=True)
+class FastCode:
+    """FAST: byte-pair merges of quantised cosine coefficients (Pertsch et al. 2025, arXiv 2501.09747, §4).
+
+    The cosine transform along time turns a chunk of normalised actions into H coefficients per DoF. They are scaled,
+    rounded, and ordered by frequency, all DoFs of the lowest frequency first. Merges join frequent sequences of them to
+    one token.
+
+    Ours: zeros at the end are dropped. An end token takes their place. So each beginning of a sequence stands for a
+    complete, coarser motion, and sequences differ in length.
+
+    Args:
+        steps: H, control steps of a chunk.
+        dofs: D, degrees of freedom of an action.
+        scale: Factor of the coefficients before rounding.
+        merges: For each merged token, the two tokens that it joins. Tokens 0, 1, … are the rounded coefficients from
+            the lowest to the highest. The merged tokens follow, then the end token.
+
+    Raises:
+        ValueError: A merge names a token that comes after it.
+    """
+
+    steps: int
+    dofs: int
+    scale: float
+    merges: tuple[tuple[int, int], ...] = ()
+
+    def __post_init__(self) -> None:
+        for token, pair in enumerate(self.merges, 2 * self.highest + 1):
+            if not all(0 <= part < token for part in pair):
+                raise ValueError(f"the merge {pair} names a token that comes after it")
+
+    @classmethod
+    def learn(cls, chunks: np.ndarray) -> FastCode:
+        """Learn the merges from chunks (n, H, D) of normalised actions."""
+        from tokenizers import Tokenizer, models, trainers
+
+        plain = cls(chunks.shape[1], chunks.shape[2], SCALE)
+        room, letters = VOCABULARY - plain.tokens, [chr(FIRST + token) for token in range(plain.end)]
+        tokenizer = Tokenizer(models.BPE())
+        size = len(letters) + max(0, room)
+        trainer = trainers.BpeTrainer(vocab_size=size, initial_alphabet=letters, show_progress=False)
+        tokenizer.train_from_iterator(plain.texts(plain.coefficients(chunks)), trainer)
+        numbers = {letter: token for token, letter in enumerate(letters)}
+        merges = []
+        for first, second in json.loads(tokenizer.to_str())["model"]["merges"]:
+            merges.append((numbers[first], numbers[second]))
+            numbers[first + second] = len(numbers)
+        return cls(plain.steps, plain.dofs, plain.scale, tuple(merges))
+
+    @property
+    def highest(self) -> int:
+        """Largest absolute value of a rounded coefficient. Actions in [−1, 1] have none above scale · √H."""
+        return math.ceil(self.scale * math.sqrt(self.steps))
+
+    @property
+    def end(self) -> int:
+        """The token that ends a chunk."""
+        return 2 * self.highest + 1 + len(self.merges)
+
+    @property
+    def tokens(self) -> int:
+        """V, number of different tokens."""
+        return self.end + 1
+
+    @property
+    def longest(self) -> int:
+        """Largest number of tokens of a chunk, the end token included."""
+        return self.steps * self.dofs + 1
+
+    @cached_property
+    def parts(self) -> list[tuple[int, ...]]:
+        """For each token, the rounded coefficients that it stands for. The end token stands for none."""
+        parts: list[tuple[int, ...]] = [(value,) for value in range(-self.highest, self.highest + 1)]
+        for first, second in self.merges:
+            parts.append(parts[first] + parts[second])
+        return [*parts, ()]
+
+    @cached_property
+    def tokenizer(self) -> Any:
+        """The `tokenizers.Tokenizer` that applies the merges to texts."""
+        from tokenizers import Tokenizer, models
+
+        texts = [chr(FIRST + token) for token in range(2 * self.highest + 1)]
+        for first, second in self.merges:
+            texts.append(texts[first] + texts[second])
+        pairs = [(texts[first], texts[second]) for first, second in self.merges]
+        return Tokenizer(models.BPE({text: token for token, text in enumerate(texts)}, pairs))
+
+    def coefficients(self, chunks: np.ndarray) -> np.ndarray:
+        """Return the rounded coefficients (n, H · D) int64, lowest frequency first, of normalised chunks (n, H, D)."""
+        from scipy.fft import dct
+
+        return np.rint(dct(chunks, axis=1, norm="ortho") * self.scale).astype(np.int64).reshape(len(chunks), -1)
+
+    def values(self, coefficients: Sequence[int]) -> np.ndarray:
+        """Return the normalised actions (H, D) of at most H · D rounded coefficients. Missing ones are zero."""
+        from scipy.fft import idct
+
+        full = np.zeros(self.steps * self.dofs)
+        full[: len(coefficients)] = coefficients
+        return np.clip(idct(full.reshape(self.steps, self.dofs) / self.scale, axis=0, norm="ortho"), -1.0, 1.0)
+
+    def texts(self, coefficients: np.ndarray) -> Iterable[str]:
+        """Yield a text for each row of coefficients (n, H · D): a character per coefficient, without final zeros."""
+        for row in coefficients:
+            yield "".join(chr(FIRST + self.highest + int(value)) for value in np.trim_zeros(row, "b"))
+
+    def encode(self, coefficients: np.ndarray) -> np.ndarray:
+        """Return the tokens (n, N) int64 of rounded coefficients (n, H · D). End tokens fill the rows up to N."""
+        tokens = np.full((len(coefficients), self.longest), self.end)
+        for row, encoded in enumerate(self.tokenizer.encode_batch(list(self.texts(coefficients)))):
+            tokens[row, : len(encoded.ids)] = encoded.ids
+        return tokens
+
+    def decode(self, tokens: Sequence[int]) -> list[int]:
+        """Return the rounded coefficients that tokens stand for, up to the first end token, at most H · D."""
+        found: list[int] = []
+        for token in tokens:
+            if token == self.end:
+                break
+            found += self.parts[token]
+        return found[: self.steps * self.dofs]
+
+
+CODES: dict[str, Callable[[np.ndarray], FastCode | None]] = {"bins": lambda chunks: None, "fast": FastCode.learn}
+"""For each code of actions, a function of chunks (n, H, D) of normalised actions that makes it. With `bins`, every
+number of an action is a token of its own, and there is nothing to learn."""

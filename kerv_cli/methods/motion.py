@@ -1,0 +1,125 @@
+"""Acceptance and stopping by the motion that tokens of a code stand for (*ours*; docs/methods.md §6)."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.limits import MOST_TOKENS, number
+from kerv_cli.base.registry import AcceptancePart, BoundaryPart
+from kerv_cli.engine.acceptance import Accepted, DistanceRule, nearest_child
+from kerv_cli.engine.decisions import Choice
+from kerv_cli.engine.parts import Boundary
+from kerv_cli.engine.tree import ROOT, TokenTree
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from kerv_cli.base.codes import FastCode
+    from kerv_cli.methods.context import Context
+
+
+def code_of(context: Context, part: str) -> FastCode:
+    """Return the code of the target's chunks.
+
+    Raises:
+        UsageError: Each of the target's tokens stands for one number. `part` names the setting that needs a code.
+    """
+    code = context.target.actions.code
+    if code is None:
+        raise UsageError(f"{part}: this target's tokens are bins; it is for a target with target.code=fast")
+    return code
+
+
+@dataclass
+class MotionAcceptanceSettings:
+    """Accept a draft token if the chunk's motion with it is close to the motion with the target's token."""
+
+    kind: str = "motion"
+    tolerance: float = number(0.1, 0, 2)  # largest difference of an action in the chunk, normalised units
+
+
+@AcceptancePart("motion", MotionAcceptanceSettings, reads_threshold=False, any_code=True)
+@dataclass(frozen=True)
+class MotionRule(DistanceRule):
+    """Accepts a draft token if the motion after it differs little from the motion after the target's token.
+
+    Both motions are decoded from the committed tokens, the accepted draft tokens before, and the token. Coefficients
+    that are still missing count as zero. The largest difference of an action in the chunk must be within `tolerance`.
+    """
+
+    tolerance: float
+
+    @classmethod
+    def build(cls, settings: Any, context: Context) -> MotionRule:
+        """Build the rule that the setting `acceptance=motion` chooses."""
+        code_of(context, "acceptance=motion")
+        return cls(context.target.actions, settings.tolerance)
+
+    @functools.cached_property
+    def basis(self) -> np.ndarray:
+        """(H · D, H · D) float64: the motion, flattened, that each coefficient of 1 stands for."""
+        import numpy as np
+        from scipy.fft import idct
+
+        code = self.space.code
+        assert code is not None
+        unit = np.eye(code.steps * code.dofs).reshape(-1, code.steps, code.dofs)
+        motions: np.ndarray = idct(unit / code.scale, axis=1, norm="ortho").reshape(len(unit), -1)
+        return motions
+
+    def limits(self, r: int) -> tuple[int, ...]:
+        """Return zeros (D,): tokens have no distance."""
+        return (0,) * self.space.dofs
+
+    def difference(self, before: Sequence[int], token: int, other: int) -> float:
+        """Return the largest difference of a normalised action between the motions of two tokens after `before`."""
+        import numpy as np
+
+        code = self.space.code
+        assert code is not None
+        start = len(code.decode(before))
+        gap = np.zeros(len(self.basis) - start)
+        for sign, one in ((1, token), (-1, other)):
+            part = code.parts[one][: len(gap)]
+            gap[: len(part)] += sign * np.array(part, dtype=float)
+        return float(np.abs(gap @ self.basis[start:]).max(initial=0.0))
+
+    def judge_after(self, tokens: Sequence[int], tree: TokenTree, target_tokens: Sequence[int], r: int) -> Accepted:
+        """Return the longest path of close motions. Of equally long paths the first wins; `r` is not used."""
+        paths: dict[int, list[int]] = {ROOT: list(tokens)}  # tokens of the chunk up to each accepted node
+        best = ROOT
+        for node, (token, parent) in enumerate(zip(tree.tokens, tree.parents, strict=True)):
+            before, target = paths.get(parent), target_tokens[parent + 1]
+            if before is None or self.space.end in before:
+                continue
+            if token == target or self.difference(before, token, target) <= self.tolerance:
+                paths[node] = [*before, token]
+                best = node if len(paths[node]) > len(paths[best]) else best
+        return Accepted(tuple(tree.path_to(best)), nearest_child(tree, best, target_tokens))
+
+
+@dataclass
+class CoarseBoundarySettings:
+    """Decode at most so many tokens of a chunk: a coarse motion, since a code begins with the low frequencies."""
+
+    kind: str = "coarse"
+    tokens: int = number(4, 1, MOST_TOKENS)  # largest number of tokens
+
+
+@BoundaryPart("coarse", CoarseBoundarySettings, any_code=True)
+class Coarse(Boundary):
+    """Ends every chunk after at most `tokens` tokens. The missing coefficients, of the higher frequencies, are zero."""
+
+    @classmethod
+    def build(cls, settings: Any, context: Context) -> Coarse:
+        """Build the boundary that `boundary=coarse` chooses."""
+        code_of(context, "boundary=coarse")
+        return cls(settings, context)
+
+    def choose(self, path: np.ndarray) -> Choice:
+        """Return the limit. The path is not used."""
+        return Choice("drafter", most=self.settings.tokens)
