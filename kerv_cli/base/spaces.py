@@ -99,6 +99,11 @@ class ActionSpace:
         return self.code.tokens if self.code else self.bins - 1 + self.end_token
 
     @property
+    def kinds(self) -> int:
+        """Number of kinds of tokens: D, one per DoF. 1 with a code, whose tokens belong to no single DoF."""
+        return 1 if self.code else self.dofs
+
+    @property
     def end(self) -> int | None:
         """The token that ends a chunk. None: all chunks of H control steps have the same number of tokens."""
         return self.code.end if self.code else None

@@ -154,5 +154,5 @@ class StrictRule(DistanceRule):
     """Accepts only draft tokens that equal the target's. Decoding is then lossless."""
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """Return zero for every DoF (D,), whatever `r` is."""
-        return (0,) * self.space.dofs
+        """Return zero for every DoF (D,), whatever `r` is. With a code, which has no DoFs: a single zero."""
+        return (0,) * self.space.kinds

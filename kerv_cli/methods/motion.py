@@ -72,8 +72,8 @@ class MotionRule(DistanceRule):
         return motions
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """Return zeros (D,): tokens have no distance."""
-        return (0,) * self.space.dofs
+        """Return a single zero: tokens have no distance."""
+        return (0,)
 
     def difference(self, before: Sequence[int], token: int, other: int) -> float:
         """Return the largest difference of a normalised action between the motions of two tokens after `before`."""

@@ -297,7 +297,7 @@ def tally_of(study: Study, episodes: Sequence[int]) -> Tally | None:
             continue
         start, accepted, nodes = (rounds.field(name).to_numpy() for name in ("start", "accepted", "tree_size"))
         judged = pc.list_value_length(rounds.field("drafted")).to_numpy().astype(np.int64)
-        dofs = len(study.decodes(part[:1], ("actions",))["actions"][0].as_py()[0])
+        dofs = len(rounds.field("threshold")[0])
         tally = Tally.of(start, judged, accepted, nodes, dofs)
         total = tally if total is None else total + tally
     return total

@@ -72,7 +72,7 @@ class OpenPi(Conversation):
         super().__init__(policy, log)
         self.last, self.last_hand = np.zeros((0, 0)), np.zeros(3)
         self.decodes = 0
-        self.tally = Tally.of_records((), self.interface.actions.dofs)
+        self.tally = Tally.of_records((), self.interface.actions.kinds)
 
     def greeting(self) -> bytes:
         """Return the first message to the client: what it must know about the policy, as `metadata` describes it."""
@@ -113,7 +113,7 @@ class OpenPi(Conversation):
         record = self.policy.decode(self.decoder, observation)
         self.last, self.last_hand = record.actions, hand
         self.decodes += 1
-        self.tally += Tally.of_records((record,), self.interface.actions.dofs)
+        self.tally += Tally.of_records((record,), self.interface.actions.kinds)
         timing = {"infer_ms": 1000 * record.seconds}
         return {
             "actions": self.interface.converted(record.actions),

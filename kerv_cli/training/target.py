@@ -208,7 +208,10 @@ def load_training(
         actions = old.actions
     else:
         actions = manifest.actions.fitted(samples.chunks[:, 0].numpy().astype(np.float64))
-    code = CODES[shapes.code](actions.normalise(samples.chunks.numpy()))
+    if old is not None and (old.settings.code, old.chunk) == (shapes.code, shapes.chunk):
+        code = old.actions.code
+    else:
+        code = CODES[shapes.code](actions.normalise(samples.chunks.numpy()))
     if old is not None:
         return continued_target(shapes, old, camera, code), samples
     return CompactTarget(replace(shapes), replace(actions, code=code), observation, words, camera), samples

@@ -1,0 +1,115 @@
+"""Targets with FAST tokens: what drafts for them, what is refused, acceptance and stopping by motion."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mock_target import SEVEN, MockTarget
+
+from kerv_cli.base.codes import FastCode
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.registry import BoundaryPart, part_of
+from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.tree import TokenTree
+from kerv_cli.methods.compose import Method
+from kerv_cli.methods.context import Context
+from kerv_cli.methods.lookup import LookupProposer, LookupProposerSettings
+from kerv_cli.methods.motion import MotionRule
+from kerv_cli.methods.settings import MethodSettings
+
+RNG = np.random.default_rng(0)
+CHUNKS = np.cumsum(RNG.normal(0, 0.2, (400, 4, 7)), 1).clip(-1, 1)
+SPACE = replace(SEVEN, low=(-1.0,) * 7, high=(1.0,) * 7, code=FastCode.learn(CHUNKS))
+TARGET = MockTarget(SPACE, 4, seed=2)
+
+
+def shown(number: int) -> Observation:
+    return Observation(np.array([0.1 * number]), np.zeros(0), "word " * 3)
+
+
+def chosen(**names: str) -> Method:
+    """A method of default parts, and of these."""
+    settings = MethodSettings(**{kind: part_of(kind, name).default for kind, name in names.items()})
+    return Method.of(settings)
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"acceptance": "relaxed"},
+        {"acceptance": "sequence"},
+        {"threshold": "kinematic"},
+        {"rectifier": "compensate"},
+        {"proposer": "kalman"},
+        {"prefill_draft": "hold"},
+        {"skip": "streak", "prefill_draft": "early"},
+        {"skip": "speed"},
+    ],
+)
+def test_parts_that_need_a_distance_are_refused_in_one_line(parts):
+    chosen(acceptance="strict").check(TARGET)
+    with pytest.raises(UsageError, match=r"needs a distance between tokens.*method=naive_sd"):
+        chosen(**{"acceptance": "strict", **parts}).check(TARGET)
+
+
+@pytest.mark.parametrize("parts", [{"acceptance": "motion"}, {"boundary": "coarse"}])
+def test_what_needs_a_code_is_refused_for_bins(parts):
+    with pytest.raises(UsageError, match=r"tokens are bins.*target\.code=fast"):
+        chosen(**{"acceptance": "strict", **parts}).decoder(MockTarget(SEVEN, 4, seed=2), lambda kind: None)
+
+
+def test_lookup_drafts_what_followed_in_the_last_chunk_and_loses_nothing():
+    proposer = LookupProposer(LookupProposerSettings())
+    plain = Decoder(TARGET)
+    fast = Decoder(TARGET, Parts(prefill_draft=proposer, proposer=proposer))
+    accepted = 0
+    for number in (0, 0, 1, 1, 2):  # the same observation again gives the same chunk, which is accepted whole
+        expected, record = plain.decode(shown(number)), fast.decode(shown(number))
+        assert record.tokens == expected.tokens
+        accepted += sum(one.accepted for one in record.rounds)
+    assert accepted
+    chunk = fast._new_chunk(TARGET.encode(shown(0)), None)
+    chunk.situation.last[:] = [5, 6, 7, 5, 6, 8, 9]
+    for committed, drafted in (
+        ([], [5, 6, 7]),
+        ([5, 6], [7, 5, 6]),
+        ([1, 5, 6], [7, 5, 6]),
+        ([1, 1, 1, 5, 6], [8, 9]),
+        ([7, 9, 1], [5, 6, 8]),
+    ):
+        chunk.tokens[:] = committed
+        assert proposer.chains(chunk, 3) == [drafted]
+
+
+def test_motion_accepts_what_moves_alike_and_the_actions_stay_within_the_tolerance():
+    code, tolerance = SPACE.code, 0.2
+    assert code is not None
+    rule, middle = MotionRule(SPACE, tolerance), code.highest
+    near, far = middle + 1, middle + 20  # the first coefficient, 1 or 20 above zero
+    gap = np.abs(code.values([1]) - code.values([0])).max()
+    assert rule.difference([], near, middle) == pytest.approx(gap)
+    # after other tokens, too, and for a merged token against the end
+    before, merged = [middle, far, near], code.end - 1
+    found = code.decode([*before, merged])
+    unclipped = rule.basis[: len(found)].T @ np.array(found) - rule.basis[: len(before)].T @ np.array(
+        code.decode(before)
+    )
+    assert rule.difference(before, merged, code.end) == pytest.approx(np.abs(unclipped).max())
+    tree = TokenTree.build([near, far, near], [-1, -1, 0])
+    assert rule.judge_after([], tree, [middle, middle, middle, middle], 0) == ((0, 2), None)
+    assert rule.judge_after([], tree, [far, middle, middle, middle], 0) == ((1,), None)
+    assert MotionRule(SPACE, 0.0).judge_after([], tree, [near, near, far, far], 0) == ((0, 2), None)
+    # nothing is accepted after an end token
+    ended = TokenTree.build([code.end, near], [-1, 0])
+    assert rule.judge_after([], ended, [code.end, near, near], 0).path == (0,)
+
+
+def test_a_coarse_boundary_ends_chunks_early_with_a_complete_motion():
+    context = Context(TARGET, lambda kind: None)
+    settings = BoundaryPart.find("coarse").settings(tokens=3)
+    coarse = BoundaryPart.find("coarse").built(settings, context)
+    record, whole = (Decoder(TARGET, parts).decode(shown(1)) for parts in (Parts(boundary=coarse), Parts()))
+    assert record.tokens == whole.tokens[:3]
+    assert record.size == record.forwards == 3
+    assert record.actions.shape == whole.actions.shape
