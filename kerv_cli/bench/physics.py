@@ -363,5 +363,11 @@ def openvla(name: str, language: Language, towers: Sequence[Tower]) -> Shape:
 
 INSTRUCTION = 25
 """Number of prompt tokens of an instruction."""
-SHAPES = {"openvla-7b": openvla("openvla-7b", Language(), tuple(TOWERS.values()))}
-"""Shapes by name. The prompt of OpenVLA-7B is 256 patches and an instruction of 25 tokens."""
+GEMMA = Language(257_152, 2048, 16_384, 18, 8, 1)
+"""PaliGemma's language model, Gemma 2B."""
+SHAPES = {
+    "openvla-7b": openvla("openvla-7b", Language(), tuple(TOWERS.values())),
+    "pi0-fast": vla_shape("pi0-fast", GEMMA, 3 * 256 + INSTRUCTION, encoder_of_weights(414e6, 3 * 256)),
+}
+"""Shapes by name. The prompt of OpenVLA-7B is 256 patches and an instruction of 25 tokens, π0-FAST's the patches of three
+images. Its encoder is SigLIP So400m and a projector."""

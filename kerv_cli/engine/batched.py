@@ -112,8 +112,8 @@ def greedy(target: Target, prompt: Tensor, cache: Cache | None = None, size: int
         size: Number of tokens N; 0 for as many as the target's chunk has.
 
     Returns:
-        The N most probable tokens of each prompt, (B, N). And the hidden states (B, P + N − 1, E) of the prompt and of
-        all tokens but the last.
+        The N most probable tokens of each prompt, (B, N). After an end token there are only end tokens. And the hidden
+        states (B, P + N − 1, E) of the prompt and of all tokens but the last.
     """
     length, size = prompt.shape[1], size or target.actions.longest(target.chunk)
     cache = cache or target.new_cache(len(prompt), length + size)
@@ -123,4 +123,8 @@ def greedy(target: Target, prompt: Tensor, cache: Cache | None = None, size: int
     for position in positions[length:].split(1):
         hidden.append(target.forward(target.embed(tokens[-1][:, None]), position, cache))
         tokens.append(target.head(hidden[-1][:, -1]).argmax(-1))
-    return torch.stack(tokens, 1), torch.cat(hidden, 1)
+    found, end = torch.stack(tokens, 1), target.actions.end
+    if end is not None:
+        is_end = (found == end).long()
+        found = found.masked_fill(is_end.cumsum(1) > is_end, end)
+    return found, torch.cat(hidden, 1)

@@ -349,10 +349,11 @@ class EagleDrafter(TrainableDrafter):
         following = torch.cat([prompt[:, 1:], target.embed(tokens[:, :-1])], 1)
         positions = torch.arange(hidden.shape[1] - 1, device=device)
         total, metrics = hidden.new_zeros(()), {}
+        counted = (tokens[:, :-1] == target.actions.end).cumsum(1) == 0 if target.actions.code else None
         inputs = hidden[:, :-1]
         for number in range(settings.unroll):
             predicted = network(following, inputs, positions)
-            state_loss, token_loss = compared(target, predicted[:, length - 1 :], hidden[:, length:])
+            state_loss, token_loss = compared(target, predicted[:, length - 1 :], hidden[:, length:], counted)
             total = total + settings.state_weight * state_loss + settings.token_weight * token_loss
             metrics[f"token_loss_{number}"] = float(token_loss.detach())
             # after the first drafted position the next pass reads its own predictions, as in drafting
@@ -372,17 +373,22 @@ class EagleDrafter(TrainableDrafter):
         return {"score": relaxed + strict, "acceptance_length_strict": strict, "acceptance_length_r9": relaxed}
 
 
-def compared(target: ReadableTarget, predicted: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+def compared(
+    target: ReadableTarget, predicted: Tensor, hidden: Tensor, counted: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Compare predicted hidden states with the target's, at the chunk's tokens 1 to N − 1.
 
     Args:
         target: The target.
         predicted: (B, N − 1, E) states that the drafter predicts.
         hidden: (B, N − 1, E) the target's states.
+        counted: (B, N − 1) bool, which of them count: those before the end token. None: all.
 
     Returns:
         The smooth L1 loss of the states, and the cross-entropy of the drafter's token distribution with the target's.
     """
+    if counted is not None:
+        predicted, hidden = predicted[counted], hidden[counted]
     teacher, logits = (target.head(states.to(target.dtype)).float() for states in (hidden, predicted))
     cross_entropy = -(teacher.softmax(-1) * F.log_softmax(logits, -1)).sum(-1).mean()
     return F.smooth_l1_loss(predicted, hidden), cross_entropy
