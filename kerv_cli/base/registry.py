@@ -156,6 +156,22 @@ class Part:
         """The part's default settings."""
         return self.settings(kind=self.name)
 
+    def check_code(self, group: str, coded: bool) -> None:
+        """Refuse a part that needs a distance between tokens, if they have none.
+
+        Args:
+            group: Name of the setting that chooses the part, for the error message.
+            coded: Whether the target's tokens are a code of whole chunks.
+
+        Raises:
+            UsageError: The part needs a distance.
+        """
+        if coded and not (self.absent or self.any_code):
+            raise UsageError(
+                f"{group}={self.name}: it needs a distance between tokens, and the target's code has none; choose a "
+                "lossless method, such as method=naive_sd"
+            )
+
     def needed(self, settings: Any) -> tuple[str, ...]:
         """Return the kinds of artifacts that must exist to use the part with these settings."""
         return self.needs(settings) if callable(self.needs) else self.needs

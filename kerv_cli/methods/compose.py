@@ -87,20 +87,12 @@ class Method:
         for kind in self.parts:
             check_settings(self.settings[kind], kind)
         chunk_steps(self.chunk, target.chunk)
-        self._check_code(target)
+        for kind, part in self.parts.items():
+            part.check_code(kind, bool(target.actions.code))
         self._check_drafts()
         check_parallel(self.parts, is_parallel(target))
         self._check_skip()
         self._check_batch(batch)
-
-    def _check_code(self, target: Target | TargetDescription) -> None:
-        """Check that no part needs a distance between tokens, if the target's tokens have none."""
-        for kind, part in self.parts.items():
-            if target.actions.code and not (part.absent or part.any_code):
-                raise UsageError(
-                    f"{kind}={part.name}: it needs a distance between tokens, and the target's code has none; choose a "
-                    "lossless method, such as method=naive_sd"
-                )
 
     def _check_drafts(self) -> None:
         """Check the proposer, the boundary and the prefill draft.

@@ -104,6 +104,7 @@ def calibrate(
     tasks = resolve_tasks(settings.task or list(dataset.manifest.tasks))
     chosen = choose_episodes(dataset, tasks, settings.episodes)
     method = Method.of(RolloutSettings(**{kind: find(kind, name).default for kind, name in DRAFTS.items()}))
+    method.check(target)
     no_drafter = [kind for kind in method.needs if not artifacts.exists(kind)]
     missing = [*no_drafter]
     if artifacts.exists("datastore"):

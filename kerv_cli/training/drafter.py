@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from kerv_cli.base.registry import find
+from kerv_cli.base.registry import ProposerPart, find
 from kerv_cli.base.runtime import set_up
 from kerv_cli.lab.database import Database
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
@@ -50,6 +50,7 @@ def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Beg
     description.check_autoregressive(
         f"policy.target={settings.policy.target}", "there are no greedy decodes to imitate"
     )
+    ProposerPart.find(drafter.kind).check_code("drafter", bool(description.actions.code))
     settings, dataset = demos_for(settings, description, database)
     tasks = resolve_tasks(settings.task) if settings.task else ()
     if tasks:
