@@ -369,5 +369,6 @@ SHAPES = {
     "openvla-7b": openvla("openvla-7b", Language(), tuple(TOWERS.values())),
     "pi0-fast": vla_shape("pi0-fast", GEMMA, 3 * 256 + INSTRUCTION, encoder_of_weights(414e6, 3 * 256)),
 }
-"""Shapes by name. The prompt of OpenVLA-7B is 256 patches and an instruction of 25 tokens, π0-FAST's the patches of three
-images. Its encoder is SigLIP So400m and a projector."""
+"""Shapes by name. The prompt of OpenVLA-7B is 256 patches and an instruction of 25 tokens.
+
+π0-FAST reads three images of 256 patches with SigLIP So400m and a projector."""
