@@ -27,8 +27,8 @@ class FastCode:
     """FAST: byte-pair merges of quantised cosine coefficients (Pertsch et al. 2025, arXiv 2501.09747, §4).
 
     The cosine transform along time turns a chunk of normalised actions into H coefficients per DoF. They are scaled,
-    rounded, and ordered by frequency, all DoFs of the lowest frequency first. Merges join frequent sequences of them to
-    one token.
+    rounded, and ordered by frequency, all DoFs of the lowest frequency first. A merge replaces a frequent pair of
+    neighbouring tokens by one new token.
 
     Ours: zeros at the end are dropped. An end token takes their place. So each beginning of a sequence stands for a
     complete, coarser motion, and sequences differ in length.
@@ -74,7 +74,7 @@ class FastCode:
 
     @property
     def highest(self) -> int:
-        """Largest absolute value of a rounded coefficient. Actions in [−1, 1] have none above scale · √H."""
+        """Largest absolute value of a rounded coefficient, for actions in [−1, 1]: scale · √H, rounded up."""
         return math.ceil(self.scale * math.sqrt(self.steps))
 
     @property
@@ -118,7 +118,7 @@ class FastCode:
         return np.rint(dct(chunks, axis=1, norm="ortho") * self.scale).astype(np.int64).reshape(len(chunks), -1)
 
     def values(self, coefficients: Sequence[int]) -> np.ndarray:
-        """Return the normalised actions (H, D) of at most H · D rounded coefficients. Missing ones are zero."""
+        """Return the normalised actions (H, D) of at most H · D rounded coefficients. Missing coefficients are 0."""
         from scipy.fft import idct
 
         full = np.zeros(self.steps * self.dofs)
@@ -131,14 +131,17 @@ class FastCode:
             yield "".join(chr(FIRST + self.highest + int(value)) for value in np.trim_zeros(row, "b"))
 
     def encode(self, coefficients: np.ndarray) -> np.ndarray:
-        """Return the tokens (n, N) int64 of rounded coefficients (n, H · D). End tokens fill the rows up to N."""
+        """Return the tokens (n, N) int64 of rounded coefficients (n, H · D).
+
+        N is `longest`. End tokens fill shorter rows.
+        """
         tokens = np.full((len(coefficients), self.longest), self.end)
         for row, encoded in enumerate(self.tokenizer.encode_batch(list(self.texts(coefficients)))):
             tokens[row, : len(encoded.ids)] = encoded.ids
         return tokens
 
     def decode(self, tokens: Sequence[int]) -> list[int]:
-        """Return the rounded coefficients that tokens stand for, up to the first end token, at most H · D."""
+        """Return the rounded coefficients of the tokens before the first end token, at most H · D of them."""
         found: list[int] = []
         for token in tokens:
             if token == self.end:

@@ -82,7 +82,7 @@ def write_folder(folder: Path, fill: Callable[[Path], object]) -> None:
 
     Args:
         folder: Path of the finished folder.
-        fill: Function that writes the content into the temporary folder, its argument.
+        fill: Function that takes the temporary folder, and writes the content into it.
 
     Raises:
         StorageError: The disk is full or read-only, or permission is missing.
@@ -150,7 +150,7 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def write_if_changed(path: Path, content: bytes) -> None:
-    """Write a file atomically, unless it has this content already: its time says when the content changed.
+    """Write a file atomically, unless it has this content already. So its modification time says when it changed.
 
     Raises:
         StorageError: The disk is full or read-only, or permission is missing.

@@ -50,7 +50,7 @@ def clean(folder: Path) -> list[Path]:
     """Remove the temporary files and folders of ended processes from `folder`, not from its subfolders.
 
     Returns:
-        The paths that were to be removed. A path may still exist if removing it failed.
+        The paths that the function tried to remove. A path still exists if removing it failed.
     """
     paths = [path for path in folder.glob(".*.tmp") if is_left_over(path)]
     for path in paths:
@@ -59,7 +59,7 @@ def clean(folder: Path) -> list[Path]:
 
 
 def remove(path: Path) -> None:
-    """Remove a file, or a folder with its content. What cannot be removed stays, for a later command to remove."""
+    """Remove a file, or a folder with its content. If this fails, a later command tries again, without an error."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -70,12 +70,12 @@ def remove(path: Path) -> None:
 def is_alive(pid: int, seen: float) -> bool:
     """Return whether a process of this machine that was alive at the time `seen` is still alive.
 
-    A process that has the same id but began later is another one. Only Linux tells when a process began; elsewhere a
-    process with this id counts as the same.
+    A process that has the same id but began later does not count. Only Linux tells when a process began. On any other
+    system every process with this id counts.
 
     Args:
-        pid: Its process id.
-        seen: Seconds since 1970.
+        pid: Id of the process.
+        seen: A time at which the process was alive, in seconds since 1970.
     """
     try:
         os.kill(pid, 0)

@@ -20,8 +20,8 @@ def setting(default: Any, help: str = "", **metadata: Any) -> Any:
     Args:
         default: The default value, or a function (such as a dataclass) that makes it.
         help: Description for `--help` and `--cfg`, one line.
-        **metadata: Further facts about the field. `limits`: what the function `limits` returns under this key. `names`:
-            the allowed values. `group`: for a field with the name of a folder of conf/, the file chosen by default.
+        **metadata: Further facts about the field. `limits`: the allowed range, as the function `limits` returns it.
+            `names`: the allowed values. `group`: the default file, for a field that is named like a folder of conf/.
     """
     metadata |= {"help": help} if help else {}
     if callable(default):
@@ -32,7 +32,7 @@ def setting(default: Any, help: str = "", **metadata: Any) -> Any:
 
 
 def limits(least: float = -math.inf, most: float = math.inf, above: float = -math.inf) -> dict[str, Any]:
-    """Return the metadata of a field that limits its value: a number, or every number in a list or mapping.
+    """Return metadata that limit the value of a field: a number, or every number in a list or mapping.
 
     None is always allowed, NaN never.
 
@@ -47,7 +47,7 @@ def limits(least: float = -math.inf, most: float = math.inf, above: float = -mat
 def number(
     default: float | None, least: float = -math.inf, most: float = math.inf, above: float = -math.inf, help: str = ""
 ) -> Any:
-    """Return a field of a settings dataclass that holds a number.
+    """Return a field for a settings dataclass. The field holds a number.
 
     Args:
         default: The default value. None means that the number is optional.
@@ -60,7 +60,7 @@ def number(
 
 
 def choice(default: str, *names: str, help: str = "") -> Any:
-    """Return a field of a settings dataclass whose value must be one of `names`."""
+    """Return a field for a settings dataclass. Its value must be one of `names`."""
     return setting(default, help, names=names)
 
 
@@ -70,7 +70,7 @@ def description(at: Field[Any]) -> str:
 
 
 def range_of(at: Field[Any]) -> str:
-    """Return the values that a setting may have, as in `from 1 to 1024`. Empty if it has no limits."""
+    """Return the allowed values of a setting as text, as in `from 1 to 1024`. Empty if the setting has no limits."""
     return _range_text(*at.metadata["limits"]) if "limits" in at.metadata else ""
 
 
@@ -92,7 +92,7 @@ def check_settings(settings: Any, what: str = "") -> None:
 
     Args:
         settings: The dataclass.
-        what: Name of the dataclass in error messages, such as `runtime`. Empty for the whole settings.
+        what: Name of the dataclass in error messages, such as `runtime`. Empty if it holds all settings of a command.
 
     Raises:
         UsageError: A value is not allowed. The message is about the first such value.

@@ -63,7 +63,7 @@ def read_file(kind: type[T], path: Path) -> T:
 
 
 def content_of(key: Sequence[str], chunk: int, target: str, files: Mapping[str, str]) -> str:
-    """Return one hash of all that determines what a datastore finds: these four arguments (docs/formats.md).
+    """Return a hash of the four arguments, which together determine what a datastore finds (docs/formats.md).
 
     Args:
         key: Parts of the prompt that form the search keys.

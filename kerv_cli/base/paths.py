@@ -106,7 +106,8 @@ def as_path(text: str) -> Path:
 def shipped_dir() -> Path:
     """Return the folder of the shipped policies.
 
-    It is `results/pretrained` in a checkout, else `pretrained` inside the installed package (`mt10-vision` alone).
+    In a checkout this is `results/pretrained`. Otherwise it is `pretrained` in the installed package, which holds only
+    `mt10-vision`.
     """
     package = Path(__file__).resolve().parents[1]
     checkout = package.parent / "results" / "pretrained"
@@ -156,7 +157,7 @@ def check_not_shipped(path: Path, word: str) -> None:
         word: Setting that chooses another folder, such as `policy.artifacts.scout`. Text for the error message.
 
     Raises:
-        UsageError: The folder exists and belongs to a shipped policy, and the user has not trained its artifact.
+        UsageError: The folder belongs to a shipped policy, and holds no artifact that the user has trained.
     """
     made_here = (path / RESUME).is_file()
     if path.exists() and (path.parent / "target" / "target.json").is_file() and not made_here:
@@ -164,7 +165,7 @@ def check_not_shipped(path: Path, word: str) -> None:
 
 
 def target_names(results: str) -> list[str]:
-    """Return the names of all targets: the shipped and unpacked policies, then those in the results folder."""
+    """Return the names of all targets: shipped and unpacked policies, then the targets in the results folder."""
     folder, shipped = results_dir(results), []
     for policies in (shipped_dir(), folder / "pretrained"):
         shipped += [path.parts[-3] for path in policies.glob("[!.]*/target/target.json")]

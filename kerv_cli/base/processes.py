@@ -21,8 +21,8 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA
 def end_with(parent: int) -> None:
     """Make this process end when its parent process ends, at most a few seconds later.
 
-    On Linux the kernel ends it, even if it is suspended. The kernel also ends it if only the thread ends that started
-    it: start workers from a thread that lives as long as they do.
+    On Linux the kernel ends this process, even if it is suspended. It does so, too, when the thread that started this
+    process ends. So start workers from a thread that lives as long as they do.
 
     Args:
         parent: Process id of the parent.
@@ -39,7 +39,7 @@ def end_with(parent: int) -> None:
 
 
 def begin_worker(parent: int) -> None:
-    """Prepare this process as a worker: it ends when its parent ends, and ignores Ctrl-C, which its parent handles.
+    """Prepare this process as a worker. It ends when its parent ends. It ignores Ctrl-C, which its parent handles.
 
     Libraries that have not been imported yet compute in one thread, because the workers share the cores.
 
@@ -55,7 +55,7 @@ def begin_worker(parent: int) -> None:
 class Workers(ProcessPoolExecutor):
     """A pool of worker processes, each a new interpreter. A fork could deadlock in a library that has threads.
 
-    Start it in a thread that lives as long as the workers; see `end_with`.
+    Create the pool in a thread that lives as long as the workers; see `end_with`.
 
     Args:
         count: Number of processes.
@@ -70,7 +70,7 @@ class Workers(ProcessPoolExecutor):
         return bool(self._broken)
 
     def kill(self) -> None:
-        """End all processes at once, whatever they are doing, and drop the work that waits."""
+        """End all processes at once, whatever they are doing, and drop all waiting work."""
         processes = list((self._processes or {}).values())
         self.shutdown(wait=False, cancel_futures=True)
         for process in processes:
@@ -78,9 +78,10 @@ class Workers(ProcessPoolExecutor):
 
 
 def end_with_input() -> None:
-    """Make this process end when its standard input ends: a pipe that its parent holds, and never writes to.
+    """Make this process end when its standard input is closed, and ignore Ctrl-C.
 
-    It also ignores Ctrl-C, which its parent handles.
+    The input is a pipe from the parent, which never writes to it. It closes when the parent ends. The parent handles
+    Ctrl-C.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 

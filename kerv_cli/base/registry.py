@@ -67,20 +67,20 @@ class NoSettings:
 
 @dataclass(frozen=True)
 class Part:
-    """A registered part, and the decorator that registers it: one of the choices of its kind.
+    """A registered part, which is one of the choices of its kind. Also the decorator that registers the part.
 
     A subclass for each kind adds attributes that other modules read.
 
     Args:
-        name: The name by which it is chosen.
-        settings: Dataclass of its settings, with defaults and limits.
-        needs: Kinds of artifacts that must exist to use it, or a function of its settings that returns them. For an
-            artifact: kinds of artifacts from which it is made.
+        name: Name that chooses the part, such as `drafter` in `proposer=drafter`.
+        settings: Dataclass of the part's settings, with defaults and limits.
+        needs: Kinds of artifacts that the part needs, such as `drafter`, or a function that returns these kinds for
+            the part's settings. For an artifact: kinds of artifacts from which it is made.
         colour: Colour in tables and plots, 0xRRGGBB. None: no colour of its own.
-        idle: Function of its settings. It returns those without effect, each with the reason.
+        idle: Function that takes the part's settings, and maps each setting that has no effect to the reason.
         any_code: For a part of a method: whether it works with tokens that have no distance, see `ActionSpace.code`.
-        code: The decorated class or function. None: choosing this name means having no such part, as in
-            `proposer=none`.
+        code: The decorated class or function. None for a name such as `none` in `proposer=none`: the
+            method then has no part of this kind.
     """
 
     kind: ClassVar[str]
@@ -94,7 +94,7 @@ class Part:
     code: Any = field(default=None, kw_only=True)
 
     def __call__(self, code: C) -> C:
-        """Register the part whose class or function is decorated. Return the class or function.
+        """Register the part with the decorated class or function. Return that class or function.
 
         Raises:
             UsageError: The class lacks methods of its interface, or another part has the name.
@@ -129,7 +129,7 @@ class Part:
 
         Args:
             name: Name of the part.
-            what: Text for the error message instead of the kind.
+            what: What the name stands for, text for the error message. Empty: the kind.
 
         Raises:
             UnknownName: No part of this kind has the name. The message suggests similar names.
@@ -138,17 +138,17 @@ class Part:
 
     @property
     def module(self) -> str:
-        """Name of the module that contains its code. Empty for a name that means having no such part."""
+        """Name of the module that defines the part. Empty if there is no part, as in `proposer=none`."""
         return getattr(self.code, "__module__", "")
 
     @property
     def origin(self) -> str:
-        """Its code as text, `module:name`."""
+        """Module and name of the part's class or function, as `module:name`. Empty if there is no part."""
         return "" if self.code is None else f"{self.module}:{self.code.__qualname__}"
 
     @property
     def absent(self) -> bool:
-        """Whether choosing this name means having no such part, as in `proposer=none`."""
+        """Whether the method has no part of this kind if this name is chosen, as in `proposer=none`."""
         return self.code is None
 
     @property
@@ -157,7 +157,7 @@ class Part:
         return self.settings(kind=self.name)
 
     def check_code(self, group: str, coded: bool) -> None:
-        """Refuse a part that needs a distance between tokens, if they have none.
+        """Refuse a part that compares tokens by distance, if the target's tokens have no distance.
 
         Args:
             group: Name of the setting that chooses the part, for the error message.
@@ -177,13 +177,13 @@ class Part:
         return self.needs(settings) if callable(self.needs) else self.needs
 
     def built(self, *arguments: Any) -> Any:
-        """Build the part: call its function, or the `build` method of its class, or the class if it has none.
+        """Build the part: call its function, or the `build` method of its class, or else the class itself.
 
         Args:
             arguments: For a part of a method, its settings and the `Context` (`kerv_cli/methods/context.py`).
 
         Returns:
-            The part. None if choosing it means having none, or if the method works without it.
+            The part. None if there is no part, as in `proposer=none`, or if the method works without the part.
         """
         return None if self.code is None else getattr(self.code, "build", self.code)(*arguments)
 
@@ -196,15 +196,15 @@ class ProposerPart(Part):
     """A proposer.
 
     Args:
-        when: PREFILL: it reads only the prompt, executed actions and committed tokens. STATES: it reads the target's
-            hidden states.
-        chains: Whether it drafts chains, so that `merged` and `skip=always` can use it.
+        when: PREFILL: the proposer reads only the prompt, executed actions and committed tokens. STATES: it reads the
+            target's hidden states.
+        chains: Whether the proposer drafts chains, so that `proposer=merged` and `skip=always` can use it.
         drafts_whole_chunk: Whether it drafts every token of a chunk.
         merged: Whether it merges chains of several proposers.
-        has_boundary: Whether a boundary chooses what drafts.
+        has_boundary: Whether a boundary chooses between retrieval and a drafter.
         looks_up: Whether it searches a datastore.
-        cost: Which cost of a profile prices its draft. Empty: none.
-        measured_by: The method that measures this cost. Empty: none.
+        cost: Kind of cost in a latency profile that gives the seconds of a draft. Empty: no kind does.
+        measured_by: Name of the method whose run measures this cost. Empty: no method does.
     """
 
     kind = "proposer"
@@ -220,14 +220,14 @@ class ProposerPart(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class DrafterPart(ProposerPart):
-    """A drafter with weights: an artifact, which `kerv train drafter drafter=NAME` trains, and a proposer.
+    """A drafter with weights. It is a proposer, and an artifact that `kerv train drafter drafter=NAME` trains.
 
     The decorated function imports and returns the subclass of `TrainableDrafter` (`kerv_cli/methods/drafters.py`).
     `settings` is the class of the proposer's settings.
 
     Args:
-        trained: Dataclass of the settings of its shapes and training.
-        sees: Whether it needs a target that reads images.
+        trained: Dataclass of the settings for the drafter's shape and training.
+        sees: Whether the drafter needs a target that reads images.
     """
 
     trained: type
@@ -239,7 +239,7 @@ class DrafterPart(ProposerPart):
         super().add()
 
     def needed(self, settings: Any) -> tuple[str, ...]:
-        """Return the drafter's own kind of artifact."""
+        """Return the kind of artifact that holds the drafter's weights: the drafter's name."""
         return (self.name,)
 
     def built(self, settings: Any, context: Any) -> Any:
@@ -252,7 +252,7 @@ class AcceptancePart(Part):
     """An acceptance rule.
 
     Args:
-        reads_threshold: Whether it has a radius.
+        reads_threshold: Whether the rule uses the acceptance radius that the threshold gives.
     """
 
     kind = "acceptance"
@@ -261,10 +261,10 @@ class AcceptancePart(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class ThresholdPart(Part):
-    """A threshold.
+    """A threshold, which chooses the acceptance radius.
 
     Args:
-        batchable: Whether it works for several episodes at once.
+        batchable: Whether the part works for several episodes at once.
     """
 
     kind = "threshold"
@@ -273,17 +273,17 @@ class ThresholdPart(Part):
 
 @dataclass(frozen=True)
 class RectifierPart(Part):
-    """A rectifier."""
+    """A rectifier, which completes a chunk after a rejection."""
 
     kind = "rectifier"
 
 
 @dataclass(frozen=True, kw_only=True)
 class BoundaryPart(Part):
-    """A boundary.
+    """A boundary, which decides what drafts the next chunk, or how many tokens of the chunk are decoded.
 
     Args:
-        chooses: Whether it chooses what drafts for `proposer=hybrid`.
+        chooses: Whether it chooses between retrieval and the drafter, for `proposer=hybrid`.
     """
 
     kind = "boundary"
@@ -292,13 +292,13 @@ class BoundaryPart(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class SkipPart(Part):
-    """A skip rule.
+    """A skip rule, which decides whether a chunk is executed without verification.
 
     Args:
-        takes_draft: Whether it executes the prefill draft.
+        takes_draft: Whether the rule can execute the prefill draft.
         merges: Whether the prefill draft may be merged from several proposers.
-        verifies: Whether it ever verifies a draft.
-        batchable: Whether it works for several episodes at once.
+        verifies: Whether it ever lets the target verify a draft.
+        batchable: Whether the part works for several episodes at once.
     """
 
     kind = "skip"
@@ -320,12 +320,12 @@ class ArtifactPart(Part):
     """A kind of artifact. The decorated function imports and returns the subclass of `Artifact`.
 
     Args:
-        sees: Whether it needs a target that reads images.
-        by_task: Whether it contains numbers or data by task.
+        sees: Whether the artifact needs a target that reads images.
+        by_task: Whether it contains separate numbers or data for each task.
         needs_task: Whether it can be used only for tasks that it contains.
-        names_more: Whether it names further artifacts that are needed.
-        described_by: File that describes it. Empty: `<kind>.json`.
-        study: Study that makes it. Empty: none.
+        names_more: Whether its description names further artifacts that it needs.
+        described_by: Name of the file that describes the artifact. Empty: `<kind>.json`.
+        study: Name of the study that makes the artifact. Empty: no study does.
     """
 
     kind = "artifact"
@@ -337,13 +337,13 @@ class ArtifactPart(Part):
     study: str = ""
 
     def built(self) -> Any:
-        """Return the kind of artifact, an instance of a subclass of `Artifact`."""
+        """Return an instance of the subclass of `Artifact` that makes and loads artifacts of this kind."""
         return self.code()()
 
 
 @dataclass(frozen=True)
 class ColumnPart(Part):
-    """A column of tables. The decorated function turns the episodes of one setting, a data frame, into a number."""
+    """A column of tables. The decorated function maps a data frame, the episodes of one setting, to a number."""
 
     kind = "column"
 
@@ -363,7 +363,7 @@ def load(name: str) -> Any:
 
 
 def find(kind: str, name: str, what: str = "") -> Part:
-    """Return a registered part of a kind; arguments otherwise as `Part.find`.
+    """Return the registered part with this kind and name. `Part.find` explains `what`.
 
     Raises:
         UnknownName: No part of this kind has the name. The message suggests similar names.
@@ -390,11 +390,12 @@ def part_of(group: str, name: str) -> Part:
 def parts(kind: str, module: str = "") -> Mapping[str, Part]:
     """Return the parts of a kind as a map from name to part, in the order of registration.
 
-    `drafter` is a special case. It gives the parts of the kind `artifact` that have settings: only those are trained.
+    `kind="drafter"` is a special case. It returns the artifacts that have settings, because only these are trained.
 
     Args:
         kind: Kind of part.
-        module: One of kerv's own modules in MODULES. Of these only this one is imported. Empty: all are.
+        module: Name of one module in MODULES. Of kerv's own modules, only this one is then imported. Empty: import all
+            modules of the kind.
     """
     load_plugins()
     if kind == "drafter":
@@ -426,9 +427,9 @@ def _load(kind: str) -> None:
 
 @functools.cache
 def load_plugins() -> None:
-    """Register the parts of plugins: of installed packages and of the modules in `KERV_PLUGINS`.
+    """Register the parts of plugins: of installed packages, and of the modules in `KERV_PLUGINS`.
 
-    kerv's own parts come first, so that a plugin cannot take their names.
+    kerv's own parts are registered first, so that a plugin cannot take their names.
 
     Raises:
         UsageError: A plugin cannot be imported. The message names its file and line.

@@ -20,5 +20,5 @@ def distinct(rows: Iterable[Any], name: str) -> list[Any]:
 
 
 def keyed(rows: Iterable[T], name: str) -> dict[Any, T]:
-    """Return the rows by the value of an attribute, such as `label`."""
+    """Return a map from the value of an attribute, such as `label`, to the row that has this value."""
     return {getattr(row, name): row for row in rows}

@@ -18,7 +18,7 @@ def set_up(settings: RuntimeSettings) -> tuple[str, torch.dtype]:
     Stopwatches and CUDA graphs use the current device.
 
     Returns:
-        The device (`auto` is resolved to cpu or cuda), and the number format.
+        The device (cpu or cuda instead of `auto`), and the number format of the models.
 
     Raises:
         UsageError: The device does not exist on this machine.

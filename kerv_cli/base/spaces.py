@@ -44,9 +44,9 @@ class ActionSpace:
         strict: Names of the strict DoFs, such as a gripper. Their drafted tokens must equal the target's, and a
             prediction repeats their last value instead of extrapolating it.
         control_hz: Control steps per second.
-        low: (D,) the action in environment units that the normalised value -1 stands for. An environment gives its
-            limits, a policy the 1st percentile of its demonstrations.
-        high: (D,) the action that the normalised value 1 stands for: the limits, or the 99th percentile.
+        low: (D,) action in environment units that the normalised value -1 stands for: the environment's limit, or for a
+            policy the 1st percentile of its demonstrations.
+        high: (D,) action that the normalised value 1 stands for: the environment's limit, or the 99th percentile.
         bins: Number of edges on [-1, 1]. A token is the index of one of the bins - 1 intervals (OpenVLA: 256 edges).
         end_token: Whether there is one more token for the value 1. It decodes to the centre of the last interval.
             Published OpenVLA checkpoints were trained with it.
@@ -100,7 +100,7 @@ class ActionSpace:
 
     @property
     def kinds(self) -> int:
-        """Number of kinds of tokens: D, one per DoF. 1 with a code, whose tokens belong to no single DoF."""
+        """Number of kinds of tokens: D, one per DoF. With a code of whole chunks 1: no token belongs to one DoF."""
         return 1 if self.code else self.dofs
 
     @property
@@ -131,12 +131,12 @@ class ActionSpace:
 
     @cached_property
     def is_strict(self) -> np.ndarray:
-        """(D,) bool: which DoFs are strict, that is, their tokens must equal the target's. All, with a code."""
+        """(D,) bool: which DoFs are strict (tokens must equal the target's). With a code of whole chunks, all are."""
         return np.array([self.code is not None or name in self.strict for name in self.names])
 
     @cached_property
     def bounds(self) -> tuple[tuple[int, int], ...]:
-        """For each DoF, its kinematic group as (index of the first DoF, index after the last)."""
+        """For each DoF, the range of its kinematic group: (index of the group's first DoF, index after its last)."""
         ranges, first = [], 0
         for group in self.groups:
             ranges += [(first, first + group.size)] * group.size
@@ -181,7 +181,7 @@ class ActionSpace:
             start = last
 
     def strict_tokens(self, size: int) -> np.ndarray:
-        """Return (size,) bool: which of a chunk's first `size` tokens belong to strict DoFs."""
+        """Return (size,) bool: whether each of a chunk's first `size` tokens belongs to a strict DoF."""
         return np.resize(self.is_strict, size)
 
     def normalise(self, actions: np.ndarray) -> np.ndarray:
@@ -207,7 +207,7 @@ class ActionSpace:
         return self.bins_of(self.normalise(actions))
 
     def decode(self, tokens: np.ndarray) -> np.ndarray:
-        """Return the actions (..., D) in environment units of tokens (..., D): the centres of their bins."""
+        """Return the actions (..., D) of tokens (..., D): the centres of the tokens' bins, in environment units."""
         return self.unnormalise(self.values_of(tokens))
 
     def longest(self, steps: int) -> int:
@@ -221,7 +221,7 @@ class ActionSpace:
         return self.code.encode(self.code.coefficients(self.normalise(chunks)))
 
     def chunk_values(self, tokens: Sequence[int], steps: int) -> np.ndarray:
-        """Return the normalised actions (h, D) of a chunk's tokens: `steps` of them, or fewer if tokens are missing."""
+        """Return the normalised actions (h, D) of a chunk's tokens. h is `steps`, or less if tokens are missing."""
         if self.code is None:
             return self.values_of(np.asarray(tokens)).reshape(-1, self.dofs)
         return self.code.values(self.code.decode(tokens))[:steps]
@@ -274,7 +274,7 @@ def _text(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Place:
-    """Where something that the task is about stands, such as the object: `state[first : first + 3]` of the simulator.
+    """A 3D position that matters to the task, such as the object's. It is `state[first : first + 3]` of the simulator.
 
     Args:
         name: Name of the place.
@@ -287,9 +287,9 @@ class Place:
 
 @dataclass(frozen=True)
 class ObservationSpace:
-    """The numbers that an environment observes besides images.
+    """The numbers that an environment observes besides images: proprioception and privileged state.
 
-    The privileged state is what only the simulator knows. A policy that reads images does not see it.
+    Only the simulator knows the privileged state. A policy that reads images does not see it.
 
     Args:
         proprioception: Names of the numbers of proprioception, the robot's own measurements. The first three are the
