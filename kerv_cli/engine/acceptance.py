@@ -123,7 +123,7 @@ class DistanceRule(Buildable):
         return cls(context.target.actions)
 
     def of_drafts_from(self, proposer: str) -> DistanceRule:
-        """Return the rule for drafts of the proposer with this name. The base class uses one rule for all proposers."""
+        """Return the acceptance rule for drafts of the proposer with this name. The base class returns itself."""
         return self
 
     def same_limits(self, r: int, strict: bool = True) -> tuple[int, ...]:

@@ -108,12 +108,12 @@ def greedy(target: Target, prompt: Tensor, cache: Cache | None = None, size: int
     Args:
         target: The policy.
         prompt: The prompts' embeddings (B, P, E).
-        cache: An empty cache with room for P + N tokens; None for a new one.
-        size: Number of tokens N; 0 for as many as the target's chunk has.
+        cache: An empty cache with room for P + N tokens. None: make a new cache.
+        size: N, number of tokens to decode. 0: the most that a chunk of the target can have.
 
     Returns:
-        The N most probable tokens of each prompt, (B, N). After an end token there are only end tokens. And the hidden
-        states (B, P + N − 1, E) of the prompt and of all tokens but the last.
+        Two tensors. The decoded tokens (B, N), which after an end token are all end tokens. The hidden states
+        (B, P + N − 1, E) of the prompt and of all decoded tokens but the last.
     """
     length, size = prompt.shape[1], size or target.actions.longest(target.chunk)
     cache = cache or target.new_cache(len(prompt), length + size)

@@ -30,7 +30,7 @@ def chunk_steps(chunk: int, trained: int) -> int:
     """Return the number of control steps to decode at once.
 
     Args:
-        chunk: Number of control steps that the user chose; 0 for as many as `trained`.
+        chunk: Number of control steps that the user chose. 0: use `trained`.
         trained: Number of control steps that the target was trained for.
 
     Raises:
@@ -196,7 +196,7 @@ class Chunk:
 
     @property
     def size(self) -> int:
-        """Number of tokens N in the complete chunk. It is the largest number if an end token can end the chunk."""
+        """Number of tokens N in the complete chunk. With an end token, N is the largest possible number."""
         longest = self.space.longest(self.steps)
         most = self.choice.most if self.choice is not None else None
         return longest if most is None else min(longest, most)
@@ -208,7 +208,7 @@ class Chunk:
 
     @property
     def remaining(self) -> int:
-        """Number of tokens still to be decoded, at most. 0 if the chunk has ended."""
+        """Largest number of tokens that can still be decoded. 0 if the chunk has ended."""
         return 0 if self.ended else self.size - len(self.tokens)
 
     @property
@@ -244,8 +244,8 @@ class Chunk:
             chain: Draft of the whole chunk, N tokens.
 
         Returns:
-            The target's token at each of the first N − 1 positions or more. None if the first round did not verify
-            this chain, or verified fewer than N − 1 tokens of it.
+            The target's token at each verified position, N − 1 or N tokens. None if the first round did not verify this
+            chain, or verified fewer than N − 1 tokens of it.
         """
         if not self.rounds:
             return None
@@ -301,7 +301,8 @@ class Chunk:
     def rectify(self, found: Rectified, with_target_token: bool) -> None:
         """Commit the values that a rectifier predicted.
 
-        The robot executes these values without rounding. If decoding continues, the target reads the nearest tokens.
+        The robot executes these values without rounding. If decoding continues, the target reads the
+        nearest tokens instead.
 
         Args:
             found: What the rectifier predicted.
@@ -329,7 +330,7 @@ class Chunk:
     def record(
         self, actions: np.ndarray, seconds: float, phases: dict[str, float], similarity: float | None = None
     ) -> DecodeRecord:
-        """Return the record of the complete chunk. Each argument becomes the record's attribute of the same name."""
+        """Return the record of the complete chunk. The arguments become the record's attributes of the same names."""
         return DecodeRecord(
             tokens=tuple(self.tokens),
             actions=actions,

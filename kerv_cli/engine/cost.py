@@ -35,9 +35,9 @@ COUNTED = ("mode", "proposer", "start", "tree_size", "accepted", "levels")
 
 
 def source_costs() -> dict[str, list[str]]:
-    """Return the names of the proposers whose drafts take their seconds from a profile, by kind of cost.
+    """Map each kind of cost to the names of the proposers whose drafting time this cost gives.
 
-    The drafts of all other proposers keep their recorded seconds.
+    For all other proposers, the cost model keeps the recorded drafting time.
     """
     costs: dict[str, list[str]] = {}
     for name, part in ProposerPart.every().items():
@@ -158,7 +158,7 @@ class Work:
 
     @property
     def needs(self) -> list[str]:
-        """Kinds of costs that a profile must contain for the seconds of this work to be computed from it."""
+        """Kinds of costs that a profile must contain, so that `prices` can estimate the seconds of this work."""
         return [*self.calls, *self.sources]
 
 
@@ -172,10 +172,10 @@ def work_of(
     """Return what several decodes computed, from the columns of their records.
 
     Args:
-        rounds: One array (n,) for each of the attributes of `Round` that `COUNTED` names. Its values are those of the n
-            rounds of all decodes, in order.
+        rounds: For each name in `COUNTED`, that attribute of all n rounds, (n,). The rounds of all decodes follow each
+            other in order.
         counts: Number of rounds of each decode, (decodes,).
-        phases: Recorded seconds of each of `READ_PHASES`, (decodes,).
+        phases: For each name in `READ_PHASES`, the recorded seconds of that phase, (decodes,).
         looked_up: Whether the decode searched the datastore, (decodes,) bool.
         size: Number of tokens N in a chunk.
     """
@@ -227,8 +227,8 @@ def work_of_record(decode: DecodeRecord) -> Work:
 def prices(work: Work, profile: Profile) -> np.ndarray:
     """Estimate the seconds of each decode, (decodes,).
 
-    Forwards and the drafter's drafts take the profile's seconds. Other proposers' drafts do so, too, if the profile
-    has their times. Everything else takes its recorded seconds.
+    The profile gives the seconds of forwards and of the drafter's drafts. It also gives those of other proposers'
+    drafts, if it has their times. Everything else keeps its recorded seconds.
     """
     total = np.array(work.host, dtype=float)
     for kind, (decode, rows, with_prompt) in work.calls.items():

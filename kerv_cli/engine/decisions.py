@@ -37,8 +37,8 @@ class SkipDecision(NamedTuple):
     """What a skip rule decides about a chunk.
 
     Attributes:
-        tokens: The N tokens of the chunk, which are executed without verification. None: the target decodes.
-        proposer: Name of the proposer that drafted them. PARALLEL (`record.py`): a parallel target computed them.
+        tokens: The N tokens of the chunk, which are executed without verification. None: the target decodes the chunk.
+        proposer: Name of the proposer that drafted `tokens`. PARALLEL (`record.py`): a parallel target computed them.
         reason: The rule's reason to skip or to verify, which `DecodeRecord.reason` stores. None: no reason is given.
     """
 

@@ -81,8 +81,8 @@ class Decoder(ActionDecoder):
 
         Args:
             target: The policy that decodes and verifies.
-            parts: The method's parts; None for autoregressive decoding.
-            chunk: Number of control steps H to decode at once; 0 for as many as the target was trained for.
+            parts: The method's parts. None: decode autoregressively.
+            chunk: H, number of control steps to decode at once. 0: the number that the target was trained for.
 
         Raises:
             UsageError: `chunk` is longer than the target was trained for.
@@ -172,7 +172,7 @@ class Decoder(ActionDecoder):
 
         Args:
             prompt: The prompt's embeddings (1, P, E), or a function that computes them when they are first needed.
-            stopwatch: Measures the phases; None for a new one.
+            stopwatch: Measures the phases. None: make a new stopwatch.
             observation: Needed only by drafters that read images or states themselves.
 
         Returns:
@@ -245,7 +245,7 @@ class Decoder(ActionDecoder):
         """Decode the remaining tokens with one forward each, and return them.
 
         Each token stays on the device as the input of the next forward. The CPU reads all tokens after the last
-        forward. Only if an end token can end the chunk, it reads each of them at once.
+        forward. But if an end token can end the chunk, the CPU reads each token right after its forward.
         """
         target, cache = self.target, chunk.target.cache
         first = cache.length
@@ -278,8 +278,8 @@ class Decoder(ActionDecoder):
     def verify(self, chunk: Chunk, draft: Draft) -> Verified:
         """Run the target once, over the tokens that are not in its cache yet, followed by the draft.
 
-        In the first round, the tokens that are not in the cache are the prompt. Later they are the last committed
-        token, or the tokens that a rectifier has filled.
+        In the first round, the uncached tokens are the prompt. In later rounds, this is the last committed token, or
+        the tokens that a rectifier has filled.
         """
         target, cache, uncached = self.target, chunk.target.cache, chunk.target.uncached(chunk.tokens)
         before = len(uncached) or chunk.target.prompt_length

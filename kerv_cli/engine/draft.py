@@ -27,9 +27,9 @@ class Draft:
 
     Attributes:
         tokens: (n,) int64.
-        parents: Index of each token's parent, (n,) int64; −1 is the last committed token. None for a chain.
+        parents: Index of each token's parent, (n,) int64; −1 is the last committed token. None: the draft is a chain.
         levels: Maximum depth of the tree. Needed only when `parents` is on the GPU.
-        paths: The mask `ancestors`, if the proposer has computed it already. None: computed when it is first read.
+        paths: The mask `ancestors`, if the proposer has computed it already. None: `ancestors` computes the mask.
     """
 
     tokens: Tensor
@@ -43,7 +43,7 @@ class Draft:
 
         Args:
             tokens: The n tokens.
-            parents: Index of each token's parent, −1 for the last committed token. None for a chain.
+            parents: Index of each token's parent, −1 for the last committed token. None: the draft is a chain.
         """
         return cls(_vector(tokens), None if parents is None else _vector(parents))
 
@@ -54,7 +54,7 @@ class Draft:
         """Return the draft without the tokens that come after an end token. A draft on the GPU stays as it is.
 
         Args:
-            end: The token that ends a chunk. None: there is none.
+            end: The token that ends a chunk. None: no token ends a chunk.
         """
         if end is None or self.tokens.device != HOST or end not in self.tokens:
             return self
@@ -127,7 +127,7 @@ class Draft:
     def ancestors(self) -> np.ndarray | Tensor | None:
         """Mask (n, n) bool: entry [i, j] says whether token j is token i or one of its ancestors.
 
-        The mask is on the device of `parents`. None for a chain.
+        The mask is on the device of `parents`. None if the draft is a chain.
         """
         if self.parents is None:
             return None
@@ -155,7 +155,7 @@ class Draft:
         return torch.cat([torch.arange(start, stop, device=device), stop + depths])
 
     def visible(self, before: int) -> np.ndarray | Tensor | None:
-        """Return the attention mask of a verification, (before + n, before + n) bool. None for a causal mask.
+        """Return the attention mask of a verification, (before + n, before + n) bool. None if attention is causal.
 
         Entry [i, j] says whether token i of the forward attends to token j.
 

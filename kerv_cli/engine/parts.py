@@ -29,7 +29,7 @@ class Buildable(ABC):  # noqa: B024 - its subclasses are the interfaces
 
     @classmethod
     def build(cls, settings: Any, context: Any) -> Any:
-        """Return the part that these settings choose, or None if the method needs no such part.
+        """Return the part that these settings choose. None if the method works without the part.
 
         Args:
             settings: Settings of the part.
@@ -38,7 +38,7 @@ class Buildable(ABC):  # noqa: B024 - its subclasses are the interfaces
         return cls(settings, context)
 
     def similarity(self, chunk: Chunk) -> float | None:
-        """Return the cosine of the best match in the datastore. None if it was not searched for this chunk."""
+        """Return the cosine of the best match in the datastore. None if this part did not search one for this chunk."""
         return None
 
 
@@ -99,9 +99,9 @@ class Rectifier(Buildable):
         """Start a new episode."""
 
     def next_decode(self) -> None:
-        """Note that a decode has ended.
+        """Note that a decode has ended. Called after every decode.
 
-        A rectifier that predicts nothing in the next few decodes after a prediction counts them here.
+        A rectifier that pauses for some decodes after a prediction counts these decodes here.
         """
 
     @abstractmethod
@@ -109,8 +109,8 @@ class Rectifier(Buildable):
         """Predict the missing values of the rejected control step.
 
         Returns:
-            The predicted values. None if they cannot be predicted. Then the target goes on decoding after its own token
-            at the rejected position.
+            The predicted values. None if the rectifier predicts nothing. The target then goes on decoding after its own
+            token at the rejected position.
         """
 
 
@@ -142,7 +142,7 @@ class Skip(Buildable):
 
     @abstractmethod
     def take(self, chunk: Chunk) -> SkipDecision:
-        """Decide about a chunk before the target runs."""
+        """Decide whether a chunk is executed without verification. Called before the target runs."""
 
     def verified(self, chunk: Chunk) -> None:
         """Learn how the target judged the prefill draft.

@@ -20,7 +20,7 @@ class Proposer(Buildable):
 
     Attributes:
         name: Name in the records, e.g. `drafter`.
-        nodes: Maximum number of tokens in a draft. The cache reserves room for them. 0 for as many as a chunk has.
+        nodes: Maximum number of tokens in a draft, for which the cache reserves room. 0: N, all tokens of a chunk.
     """
 
     name = ""
@@ -68,5 +68,5 @@ class ChainProposer(Proposer):
         """Return token sequences that continue the committed tokens, best first, at most `depth` tokens each."""
 
     def is_sure(self, chunk: Chunk) -> bool:
-        """Return whether the proposer expects its best chain to be accepted whole. False for this base class."""
+        """Return whether the proposer expects all tokens of its best chain to be accepted. False in this base class."""
         return False

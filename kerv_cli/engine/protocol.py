@@ -88,9 +88,9 @@ class Target(Protocol):
         Args:
             x: Embeddings of the new tokens (B, T, E).
             positions: Position of each new token in the sequence (T,), for the positional encoding.
-            cache: From `new_cache`. The new tokens attend to all cached tokens and are added to them. None: no earlier
-                tokens.
-            seen: Attention mask (T, T) bool: whether new token i attends to new token j. None for a causal mask. A
+            cache: From `new_cache`. The new tokens attend to all cached tokens and are added to the cache. None: there
+                are no earlier tokens.
+            seen: Attention mask (T, T) bool: whether new token i attends to new token j. None: attention is causal. A
                 target on a GPU may get a tensor instead of an array.
         """
 
@@ -111,7 +111,7 @@ class ContinuesGreedily(Protocol):
     """A target that can decode several tokens autoregressively in a single, faster call."""
 
     def continue_greedily(self, token: int, count: int, cache: Any, end: int | None = None) -> list[int] | None:
-        """Decode `count` tokens greedily. The cache then holds the same tokens as after `count` single forwards.
+        """Decode `count` tokens greedily. Afterwards the cache holds the same tokens as after `count` single forwards.
 
         Args:
             token: The last committed token. It is not in the cache yet.
@@ -126,7 +126,7 @@ class ContinuesGreedily(Protocol):
 
 @runtime_checkable
 class PredictsTokens(Protocol):
-    """A target with a faster way from new tokens to the tokens after them than `embed`, `forward` and `head`."""
+    """A target that predicts the next tokens in one call, faster than with `embed`, `forward` and `head`."""
 
     def predict(
         self, tokens: Tensor, positions: Tensor, cache: Any, seen: np.ndarray | Tensor | None
@@ -136,11 +136,11 @@ class PredictsTokens(Protocol):
         Args:
             tokens: The new tokens (T,) int64.
             positions: Position of each new token in the sequence (T,), for the positional encoding.
-            cache: From `new_cache`. The new tokens attend to all cached tokens and are added to them.
-            seen: Attention mask (T, T) bool: whether new token i attends to new token j. None for a causal mask.
+            cache: From `new_cache`. The new tokens attend to all cached tokens and are added to the cache.
+            seen: Attention mask (T, T) bool: whether new token i attends to new token j. None: attention is causal.
 
         Returns:
-            The most probable token after each new token, (T,) int64, and their hidden states (1, T, E).
+            The most probable token after each new token, (T,) int64, and the hidden states (1, T, E) of the new tokens.
         """
 
 
@@ -154,7 +154,8 @@ class JoinsDrafters(Protocol):
         Args:
             function: The function. Its inputs are float32 tensors of batch size 1.
             shapes: Shape of each input.
-            repeats: Whether the outputs of one call can be the inputs of the next call.
+            repeats: Whether the program can run several times in one call. The outputs of each run are the inputs of
+                the next, to decode or draft several tokens.
 
         Returns:
             The compiled program. None if the target is not compiled.
@@ -172,7 +173,7 @@ class ReadableTarget(Target, Protocol):
 
     @property
     def segments(self) -> Mapping[str, slice]:
-        """Name of each part of the prompt, such as `vision`, and the positions (a slice) of its tokens."""
+        """Map from the name of each part of the prompt, such as `vision`, to the positions of its tokens (a slice)."""
 
     @property
     def pooled_width(self) -> int:
@@ -213,5 +214,5 @@ class ParallelTarget(Target, Protocol):
 
         Args:
             prompt: Embeddings of the prompts (B, P, E).
-            cache: An empty cache with room for P + N tokens; None to compute without a cache.
+            cache: An empty cache with room for P + N tokens. None: compute without a cache.
         """

@@ -37,11 +37,11 @@ class Round:
         target_tokens: The target's tokens at the positions of `drafted`. If the whole draft was accepted and the chunk
             is not full, the bonus (the target's next token) comes after them.
         accepted: Number of accepted draft tokens.
-        committed: Number of committed tokens: the accepted ones and the bonus.
+        committed: Number of committed tokens: the accepted draft tokens and the bonus.
         tree_size: Number of draft tokens in the verified tree.
         threshold: Largest accepted distance per DoF, in bins. Empty if no acceptance rule ran.
-        levels: Number of levels that were drafted for a tree. The nodes that were kept may reach fewer levels. 0 for a
-            chain.
+        levels: Number of levels that were drafted for a tree. The nodes that were kept may reach fewer levels. 0: the
+            draft was a chain.
     """
 
     mode: str
@@ -57,7 +57,7 @@ class Round:
 
     @property
     def drafter(self) -> str:
-        """Name of the proposer that drafted; empty without a draft. The mode, if it is `skip` or `parallel`."""
+        """Name of the proposer that drafted, or empty if none did. In the modes `skip` and `parallel`, the mode."""
         if self.mode in ("skip", PARALLEL):
             return self.mode
         return "" if self.proposer == "none" else self.proposer
@@ -104,7 +104,7 @@ class DecodeRecord:
 
     @property
     def delay_steps(self) -> int | None:
-        """Number of control steps that passed during the decode; None if the world waited for it."""
+        """Number of control steps that passed during the decode. None if the world waited for the decode."""
         return None if self.delay is None else self.delay.steps
 
     @property
@@ -185,7 +185,7 @@ def variability(rounds: Sequence[Round], space: ActionSpace, measure: Measure = 
 
 
 def path_length(points: np.ndarray) -> float:
-    """Return the sum of distances between successive points (n, 3), metres; 0 for fewer than two points."""
+    """Return the sum of distances between successive points (n, 3), in metres. 0 if there are fewer than two points."""
     return float(np.linalg.norm(np.diff(points.astype(np.float64), axis=0), axis=1).sum())
 
 
@@ -219,7 +219,7 @@ class EpisodeRecord:
 
     @property
     def timed(self) -> bool:
-        """Whether the decodes have times. If several episodes were decoded at once, they have none."""
+        """Whether the decodes have times. They have none if several episodes were decoded at once."""
         return not math.isnan(self.seconds)
 
     @property

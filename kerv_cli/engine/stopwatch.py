@@ -13,8 +13,8 @@ from kerv_cli.engine.record import PHASES
 class Stopwatch:
     """Measures the seconds that each phase of one decode takes (`PHASES`).
 
-    On CUDA it records events in the stream and reads them at the end, so that measuring does not slow the decode. The
-    CPU waits for the GPU only at the start and at the end.
+    On CUDA the stopwatch records events in the stream and reads them at the end. So measuring does not slow the decode.
+    The CPU waits for the GPU only at the start and at the end.
     """
 
     def __init__(self, device: torch.device) -> None:

@@ -29,8 +29,8 @@ def read(*parts: Tensor) -> list[np.ndarray]:
     """Copy several vectors from one device to the CPU in a single transfer, and wait for it.
 
     Args:
-        parts: Vectors, which may have different lengths. If their types differ, all are returned as float64. Integers
-            stay exact, because tokens and indices are small.
+        parts: Vectors, which may have different lengths. If their types differ, all are returned as float64. Tokens and
+            indices stay exact, because they are small.
 
     Returns:
         One array per vector.

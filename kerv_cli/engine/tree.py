@@ -19,7 +19,7 @@ class TokenTree:
 
     Attributes:
         tokens: Token of each node.
-        parents: Index of each node's parent, smaller than its own; −1 is the last committed token.
+        parents: Index of each node's parent, smaller than the node's index; −1 is the last committed token.
         depths: Depth of each node; 0 is the first drafted position.
     """
 
