@@ -14,9 +14,10 @@ class TargetPart(Part):
     """A family of targets. The decorated function loads a target from (folder, description, device, dtype).
 
     Args:
-        importer: Function that `kerv build target` calls with its settings. None: targets of this family are trained.
+        importer: Function that makes a target of this family from the settings of `kerv build target`. None: targets of
+            this family are made by training.
         check_weights: Function (folder, description) that checks weights stored outside the target's folder. None: the
-            weights are in the folder.
+            weights are in the target's folder.
         images_alone: Whether targets of this family read images, but no state of the robot.
     """
 

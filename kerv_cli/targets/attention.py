@@ -34,8 +34,8 @@ class Cache:
         buffer: (layers, 2, B, A, slots, C) keys and values. A fixed cache has a spare slot after its capacity.
         layers: (2, B, A, slots, C) per layer, views of the buffer.
         length: Number of cached tokens. They are in the first slots.
-        copied: Number of slots, from the first on, whose `copies` equal the buffer. It may exceed `length`, because
-            later slots are overwritten before they are read.
+        copied: Number of slots, from the first on, whose `copies` equal the buffer. The number may exceed `length`,
+            because later slots are overwritten before they are read.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Cache:
     def compact(self, start: int, slots: Tensor) -> None:
         """Keep the tokens of an accepted path, and drop the rest of the draft tree.
 
-        The kept tokens move to the slots start, start + 1, …. The last of them is then the last token in the cache.
+        The kept tokens move to the slots start, start + 1, …. The cache then ends with the last kept token.
 
         Args:
             start: The first slot to write.
@@ -98,7 +98,7 @@ def attend(q: Tensor, k: Tensor, v: Tensor, cache: Tensor | None, slots: Slots |
 
     Args:
         q: (B, A, T, C) queries of A heads.
-        k: (B, K, T, C) keys of K heads. If K < A, several heads of queries share each of them.
+        k: (B, K, T, C) keys of K heads. If K < A, several query heads share a head of keys.
         v: (B, K, T, C) values of K heads.
         cache: (2, B, K, slots, C) keys and values of this layer. None: there are no earlier tokens.
         slots: Slots of the new tokens. None if there is no cache.
@@ -120,12 +120,12 @@ def attend(q: Tensor, k: Tensor, v: Tensor, cache: Tensor | None, slots: Slots |
 
 
 def attention_mask(seen: np.ndarray | Tensor | None, tokens: int, cache: Cache | None, like: Tensor) -> Tensor | None:
-    """Return the additive attention mask of new tokens: 0 for tokens that are seen, -inf for hidden ones.
+    """Return the additive attention mask of new tokens: 0 for visible tokens, -inf for hidden tokens.
 
     Args:
-        seen: (T, M) bool, which of the last M tokens each new token attends to. M counts the T new tokens and M − T
-            cached ones before them. Each new token attends to all earlier cached tokens. None: attention is causal. A
-            tensor must be on the device of `like`.
+        seen: (T, M) bool, which of the last M tokens each new token attends to: the M − T newest cached tokens, then
+            the T new ones. Each new token attends to all earlier cached tokens. None: attention is causal. A tensor
+            must be on the device of `like`.
         tokens: T, number of new tokens.
         cache: Cache of earlier tokens. None: there are none.
         like: Tensor whose device and number format the mask gets.

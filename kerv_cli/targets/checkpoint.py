@@ -51,16 +51,16 @@ class TargetDescription(Description):
     """The content of `target.json`.
 
     Attributes:
-        family: Registered kind of target, such as `compact`.
-        environment: Name of the environment that its demonstrations come from.
+        family: Registered family of targets, such as `compact`.
+        environment: Name of the environment that the target's demonstrations come from.
         settings: Settings of the family. They always contain `chunk`.
         actions: Action space.
         observation: Observation space.
-        cameras: Names of the camera images that it reads.
+        cameras: Names of the cameras whose images the target reads.
         words: Vocabulary of instructions.
-        provenance: How it was made.
-        state_range: Two lists, with the 0.1th and the 99.9th percentile of each number of the demonstrations' states.
-            None: not recorded.
+        provenance: How the target was made.
+        state_range: The 0.1th percentile of each number of the demonstrations' states, then the 99.9th percentile of
+            each. None: not recorded.
     """
 
     family: str
@@ -84,10 +84,10 @@ class TargetDescription(Description):
 
     @property
     def origin(self) -> Mapping[str, Any]:
-        """The policy whose tokens the target decodes, as a mapping. `sha256` is the hash of that policy's weights.
+        """Identity of the policy whose tokens the target decodes: `sha256` is the hash of the policy's weights.
 
-        Usually this policy is the target itself. A grown target (docs/methods.md §0.2) is an enlarged policy and
-        decodes the tokens of the original one. Then `base` is the folder of the original.
+        Usually the policy is the target itself. A grown target (docs/methods.md §0.2) is an enlarged policy, and
+        decodes the tokens of the original policy. Then `base` is the folder of the original policy.
         """
         return self.settings.get("grown") or {"sha256": self.sha256}
 
@@ -271,7 +271,7 @@ def target_fields(
 
 
 def read_description(folder: Path, kind: str, schema: type[T]) -> T:
-    """Return the description of an artifact. Check its fields, and that the weights have the hash that it names.
+    """Return the description of an artifact. Check the description's fields and the hash of the weights.
 
     Args:
         folder: Folder of the artifact.
@@ -307,7 +307,7 @@ def described(folder: Path, kind: str, schema: type[T]) -> T:
 
 
 def check_weights(folder: Path, kind: str, sha256: str) -> None:
-    """Check that the weights in a folder are those that its description names.
+    """Check that the weights in a folder have the hash that the description gives.
 
     Args:
         folder: Folder of the artifact.
@@ -376,14 +376,14 @@ def load_target(folder: Path, device: str = "cpu", dtype: torch.dtype | None = N
     Args:
         folder: Folder of the target.
         device: Device to load it to.
-        dtype: Number format of its weights. None means float32.
+        dtype: Number format to convert the weights to. None: float32.
 
     Returns:
         The target and its description.
 
     Raises:
         CheckpointError: The target is missing or damaged.
-        UnknownName: Its family is not registered, for example because a plugin is not installed.
+        UnknownName: The target's family is not registered, for example because a plugin is not installed.
     """
     import torch
 

@@ -90,7 +90,7 @@ class Trial:
         return ()
 
     def encode(self) -> Pairs:
-        """Check that a prompt has the right shape and finite numbers, and is the same when encoded again."""
+        """Check that a prompt has the right shape and finite numbers, and is the same in a second encoding."""
         prompt, width, longest = self.target.encode(self.observation), self.target.width, self.target.max_prompt
         right = prompt.ndim == 3 and len(prompt) == 1 and prompt.shape[2] == width
         need(right, f"encode gives {tuple(prompt.shape)}, must be (1, P, {width})")
@@ -142,7 +142,7 @@ class Trial:
     def causality(self) -> Pairs:
         """Check that a token's hidden state does not depend on later tokens.
 
-        Yields hidden states from a forward of four tokens, and those of the same tokens in a forward of all tokens.
+        Yields the hidden states of four tokens: from a forward without later tokens, and from a forward of all tokens.
         """
         yield self.plain(self.tokens[:4]), self.plain(self.tokens)[:, : self.length + 4]
 
@@ -170,8 +170,8 @@ class Trial:
         """Check that a node of a draft tree has the same hidden state as in a forward of only its own path.
 
         The whole tree is forwarded twice. First it follows cached tokens, as in a later round of a decode. Then it
-        follows the prompt in one forward, as when the prefill verifies a draft. For each node, a pair of each case
-        holds the node's hidden state in the tree, and that in a forward of its path alone.
+        follows the prompt in one forward, as when the prefill verifies a draft. Yields two pairs per node, one for each
+        case: the node's hidden state in the tree, and in a forward of only the node's path.
         """
         after = self.forward_tree()[1][:, 1:]
         positions, cache = TREE.positions(0, self.length, self.prompt.device), self.new_cache()

@@ -50,7 +50,7 @@ class Recipe(GrowSettings):
 
 
 def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
-    """Replace the layers of a stack by larger layers, and more of them, that compute the same function.
+    """Replace the layers of a stack by more and larger layers. The stack still computes the same function.
 
     Args:
         stack: A trunk or a drafter. It is changed in place.
@@ -144,7 +144,7 @@ def recipe_of(description: TargetDescription) -> Recipe:
 
 
 def check_weights(folder: Path, description: TargetDescription) -> None:
-    """Check that the policy that a grown target enlarges still has the same weights.
+    """Check that the weights of the original policy, which a grown target enlarges, have not changed.
 
     Raises:
         CheckpointError: The policy is missing, or its weights have changed.
@@ -191,7 +191,7 @@ def _grow(target: CompactTarget, shape: GrowSettings) -> None:
 
 
 def grow(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
-    """Make a grown target, for `kerv build target grow=SHAPE policy.target=NAME`: write its recipe.
+    """Make a grown target by writing its recipe, for `kerv build target grow=SHAPE policy.target=NAME`.
 
     Returns:
         The target's folder, and numbers to print by name, such as the number of weights.

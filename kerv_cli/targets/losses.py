@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 def soft_labels(tokens: int, sigma: float) -> Tensor:
-    """Return the probabilities (V, V) that a model should predict: one row for each true token.
+    """Return the probabilities (V, V) that a model should predict. Row i holds those for the true token i.
 
     A row is a Gaussian around the true token.
 
@@ -37,10 +37,10 @@ def token_loss(logits: Tensor, tokens: Tensor, labels: Tensor) -> Tensor:
 
 
 def position_loss(estimated: Tensor, places: Tensor) -> Tensor:
-    """Return half the smooth L1 loss of positions (B, K, 3) in metres. Errors are measured in units of 2 cm.
+    """Return half the smooth L1 loss of K estimated 3D positions. Errors are measured in units of 2 cm.
 
     Args:
-        estimated: Estimated positions.
-        places: True positions.
+        estimated: (B, K, 3) estimated positions in metres.
+        places: (B, K, 3) true positions in metres.
     """
     return F.smooth_l1_loss(estimated / 0.02, places / 0.02, beta=1.0) * 0.5

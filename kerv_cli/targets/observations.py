@@ -43,7 +43,7 @@ class LocatesPlaces(Protocol):
         """Return an observation as tensors on the target's device, a batch of one."""
 
     def encode_batch(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
-        """Return prompts (B, P, E), and the estimated positions (B, K, 3) in metres of K places (object, goal, …)."""
+        """Return prompts (B, P, E), and estimated 3D positions (B, K, 3) in metres of object, goal and so on."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Rows:
         return next(len(x) for x in vars(self).values() if x is not None)
 
     def where(self, chosen: Tensor) -> Self:
-        """Return the rows that are selected by a boolean mask (n,) or by indices."""
+        """Return the rows that a boolean mask (n,) or indices select."""
         columns = {name: x for name, x in vars(self).items() if x is not None}
         return replace(self, **{name: x[chosen] for name, x in columns.items()})
 
@@ -78,7 +78,7 @@ class Observations(Rows):
     """n observations, ordered by episode and control step.
 
     Attributes:
-        frames: (n, size, size x views, 3) uint8 images. None for a policy that reads the state.
+        frames: (n, size, size x views, 3) uint8 images. None if the policy reads the state.
         proprioception: (n, p) float32, the robot's own measurements.
         states: (n, s) float32, the simulator's privileged state.
         words: (n, L) int64, ids of the instruction's words.
@@ -163,7 +163,7 @@ def observed_steps(episode: DemoEpisode, sees: bool) -> np.ndarray:
 def observations_of(
     target: Target, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace
 ) -> list[Observation]:
-    """Return what a target would have observed at some control steps of a demonstration.
+    """Return what a target would have observed at the control steps `steps` of a demonstration.
 
     Args:
         target: The target. Each of its cameras gets the recorded image.
@@ -217,7 +217,7 @@ def check_tail(episode: DemoEpisode, steps: int, use: str) -> None:
     Args:
         episode: The episode.
         steps: Number of expert actions that are needed from the last control step on.
-        use: What they are needed for, text for the error message.
+        use: What the actions are needed for, text for the error message.
 
     Raises:
         CheckpointError: Too few actions were recorded after the success.

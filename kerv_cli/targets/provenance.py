@@ -32,20 +32,20 @@ def provenance_of(command: str, settings: Any, device: str, **figures: Any) -> d
         command: Name of the command that makes the artifact.
         settings: Dataclass of the command's settings.
         device: Device of torch, such as `cpu` or `cuda:0`.
-        **figures: Numbers to store with it, such as the number of parameters.
+        **figures: Numbers to store in the provenance, such as the number of parameters.
     """
     return {"command": command, "settings": asdict(settings), **figures, **provenance(device)}
 
 
 def stamp(device: str) -> dict[str, str]:
-    """Return host, device, versions and commit as strings, by the column's name in the table of episodes."""
+    """Return host, device, versions and commit as strings. The keys are columns of the table of episodes."""
     numbers = {f"{name}_version": number for name, number in versions().items()}
     return {"host": socket.gethostname(), "device_name": device_name(device), **numbers, "git_commit": git_commit()}
 
 
 @functools.cache
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of each package in PACKAGES, `absent` if it is not installed."""
+    """Return the versions of Python and of the packages in PACKAGES, by name. `absent` means not installed."""
     return {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}}
 
 

@@ -45,7 +45,7 @@ class Blocked:
         self.bias = None if bias is None else bias.to(torch.bfloat16)
 
     def __call__(self, x: Tensor) -> Tensor:
-        """Map inputs (…, inputs) to outputs (…, outputs) bfloat16. Sums are float32."""
+        """Map inputs (…, inputs) to outputs (…, outputs) bfloat16. The sums are computed in float32."""
         x = x.to(torch.bfloat16)
         product: Tensor = torch.ops.mkldnn._linear_pointwise(x, self.weight, self.bias, "none", [], "")
         return product

@@ -18,7 +18,7 @@ FORMATS = torch.float32, torch.bfloat16
 
 
 def wants_gradient(x: Tensor) -> bool:
-    """Return whether gradients of `x` are needed. Then torch must compute, because compiled modules give none."""
+    """Return whether gradients of `x` are needed. Compiled modules give no gradients, so torch must then compute."""
     return x.requires_grad and torch.is_grad_enabled()
 
 
@@ -30,13 +30,13 @@ class Compilable(nn.Module):
     `compile_parts` again.
 
     Attributes:
-        compiled: The compiled form. None if there is none.
+        compiled: The compiled form. None if the module is not compiled.
     """
 
     compiled: Any = None
 
     def new_program(self) -> Any:
-        """Return the compiled form of this module, for `compile_parts`. None if it cannot be compiled."""
+        """Return the compiled form of this module, for `compile_parts`. None if the module cannot be compiled."""
         return None
 
     def runs_compiled(self, x: Tensor) -> bool:
@@ -63,7 +63,7 @@ class CompilableLinear(Compilable, nn.Linear):
     """A linear layer that is compiled by itself, not as a part of a larger module. An example is an output head."""
 
     def new_program(self) -> Any:
-        """Return the layer as a compiled `Program`. None for a number format without kernels."""
+        """Return the compiled layer, a `Program`. None if no compiled kernels exist for the weights' number format."""
         return Program(super().forward, (1, self.in_features)) if self.weight.dtype in FORMATS else None
 
     def forward(self, x: Tensor) -> Tensor:

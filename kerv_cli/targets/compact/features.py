@@ -30,13 +30,13 @@ def mlp(*widths: int) -> nn.Sequential:
 def relative(vector: Tensor) -> Tensor:
     """Return the features (…, 6) of vectors (…, 3) in metres.
 
-    The first three are vector / 0.1 m, the others tanh(vector / 0.02 m).
+    The first three features are vector / 0.1 m, the last three tanh(vector / 0.02 m).
     """
     return torch.cat([vector / COARSE, torch.tanh(vector / FINE)], -1)
 
 
 def hand_features(proprioception: Tensor, centre: Tensor) -> Tensor:
-    """Return the proprioception (B, p) with the end effector's position relative to the centre, in units of 0.1 m.
+    """Return the proprioception (B, p), in which (position − centre) / 0.1 m replaces the end effector's position.
 
     Args:
         proprioception: (B, p), its first three numbers are the end effector's position in metres.
@@ -48,11 +48,12 @@ def hand_features(proprioception: Tensor, centre: Tensor) -> Tensor:
 def scene_features(proprioception: Tensor, places: Tensor, centre: Tensor) -> Tensor:
     """Return the scene features (B, p + 15 K − 6).
 
-    They hold all positions, the vectors from the hand to every place, and the vectors from each place to the next.
+    They hold `hand_features` (p numbers), the K places relative to the centre (3 K), and 2 K − 1 vectors: from the hand
+    to each place, and from each place to the next. `relative` turns each vector into 6 numbers.
 
     Args:
         proprioception: (B, p).
-        places: (B, K, 3) positions in metres.
+        places: (B, K, 3) positions of the task's places (object, goal, …) in metres.
         centre: (3,) middle of the workspace in metres.
     """
     vectors = torch.cat([places - proprioception[:, None, :3], places[:, 1:] - places[:, :-1]], 1)
@@ -66,10 +67,10 @@ def scene_width(space: ObservationSpace) -> int:
 
 
 def privileged_features(proprioception: Tensor, states: Tensor, space: ObservationSpace) -> Tensor:
-    """Return the features (B, `privileged_width`) that only a policy with access to the simulator's state reads.
+    """Return features (B, `privileged_width`) for a policy that reads the simulator's state.
 
-    They hold the state's extra numbers, its velocities, and two vectors for each extra place: from the hand to this
-    place, and from this place to the last of `space.places`.
+    They hold the state's extra numbers, its velocities, and two vectors for each extra place: from the hand to the
+    extra place, and from there to the last of `space.places`. `relative` turns each vector into 6 numbers.
 
     Args:
         proprioception: (B, p).
@@ -94,10 +95,10 @@ def privileged_width(space: ObservationSpace) -> int:
 
 
 def position(states: Tensor, place: Place) -> Tensor:
-    """Return the position (B, 3) of one place in metres, read from states (B, s)."""
+    """Return the 3D position (B, 3) of a place, such as the object, in metres. It is read from states (B, s)."""
     return states[:, place.first : place.first + 3]
 
 
 def places_of(states: Tensor, space: ObservationSpace) -> Tensor:
-    """Return the positions (B, K, 3) of all places in metres, read from states (B, s)."""
+    """Return the 3D positions (B, K, 3) of `space.places`, such as object and goal, in metres, from states (B, s)."""
     return torch.stack([position(states, place) for place in space.places], 1)

@@ -30,10 +30,11 @@ def save_target(
     Args:
         folder: Folder to write to.
         target: The target.
-        environment: Name of the environment that its demonstrations come from.
+        environment: Name of the environment that the target's demonstrations come from.
         provenance: How the target was made, see `provenance_of`.
         stored: Number format of the stored weights: float32, float16 or int8.
-        state_range: The 0.1th and the 99.9th percentile of the demonstrations' states. None: not recorded.
+        state_range: The 0.1th percentile of each number of the demonstrations' states, then the 99.9th percentile of
+            each. None: not recorded.
     """
     others: dict[str, Any] = {"cameras": target.cameras, "words": target.words.words, "provenance": provenance}
     if state_range:
@@ -44,7 +45,7 @@ def save_target(
 
 
 def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> CompactTarget:
-    """Load a compact target for inference. It is frozen, and compiled if the device is a CPU.
+    """Load a compact target for inference. The target is frozen and, on a CPU, compiled.
 
     Args:
         folder: Folder with the weights.

@@ -217,7 +217,7 @@ def rotate(x, to, cos, sin, channels):
 def softmax(scores, slots, scale, mask, stop):
     """Turn attention scores into weights, in place. Hidden slots get exactly 0, whatever they hold.
 
-    The sum is added up in 16 parts, so that hidden slots change no rounding.
+    The sum is computed in 16 parts, so that hidden slots do not change the rounding.
 
     Args:
         scores: Address of the scores, one per slot of the cache.
@@ -258,7 +258,7 @@ def attention(frames, out, qkv, tables, cache, start, filled, mask, keys, values
         tables: (T, 2, C) rotary cosines and sines of the tokens' positions.
         cache: (2, B, A, slots, C) keys and values of this layer, for A heads of C channels.
         start: Number of valid slots in the cache. The new tokens get the next T slots.
-        filled: Number of slots that `keys` and `values` hold already.
+        filled: Number of slots that are already copied to `keys` and `values`.
         mask: (T, start + T or more), 0 for slots that a token sees. Shape (0, 1) means that attention is causal.
         keys: (B · A, panels, C, PANEL) copy of the cached keys. It is stored like the weights of a linear layer with
             the channels as inputs and the slots as outputs, in panels of PANEL outputs. So one matrix product gives the
@@ -357,7 +357,7 @@ def elementwise(code, frame, columns, numbers, indices):
         frame: (size,) float32.
         columns: The operation's line in the table of operations, see `recording.COLUMNS`.
         numbers: Constants of all operations.
-        indices: Places that GATHER operations copy from.
+        indices: Indices in the frame that GATHER operations copy from.
     """
     out, a, b = columns[1], columns[2], columns[3]
     rows, width, stride, first = columns[4], columns[5], columns[6], columns[7]
@@ -406,7 +406,7 @@ def elementwise(code, frame, columns, numbers, indices):
 
 @compiled
 def ranked(values, best):
-    """Fill `best` (n,) with the indices of the n greatest values, in falling order. Equal values stay in their order.
+    """Fill `best` (n,) with the indices of the n greatest values, greatest first. Equal values keep their order.
 
     At least n values must be above minus infinity.
     """
@@ -428,7 +428,7 @@ def branch(frames, columns, time, start, mask, results):
     """Grow a level of EAGLE-2's tree: choose the k children of each of the k nodes, and the k best of all children.
 
     The best children become the nodes that the k frames stand for. In the first execution all frames stand for the
-    tree's root, so that only the first one counts.
+    tree's root, so that only the first frame counts.
 
     Args:
         frames: (k, size), one frame per node. It holds the logits of the node's children, and the node's hidden state.
@@ -480,15 +480,15 @@ SIGNATURE = types.void(*_TABLES, *_ALL)
 def run(
     ops, begin, end, last, indices, numbers, frames, positions, start, cache, keys, values, filled, mask, results, stop
 ):
-    """Execute a table of operations on all frames, from the `begin`-th time to the `end`-th.
+    """Execute a table of operations on all frames, `end` − `begin` times.
 
-    After each execution the rotary positions grow by one, and the number of cached tokens by T.
+    After each execution the rotary positions grow by 1, and the number of cached tokens grows by T.
 
     Args:
         ops: (operations, columns) int64, see `recording.COLUMNS`.
-        begin: Number of earlier executions.
-        end: Number of executions, earlier ones included.
-        last: Number of operations in the last execution. It leaves out those that only prepare a further execution.
+        begin: Number of executions in earlier calls.
+        end: Number of executions after this call, those of earlier calls included.
+        last: Number of operations in the last execution. Operations that only prepare a further one are left out.
         indices: Places (indices in a frame) that GATHER operations copy from.
         numbers: Constants of all operations.
         frames: (B · T, size) float32, one frame (memory) per row. They hold the inputs, and afterwards the outputs.
@@ -497,11 +497,11 @@ def run(
         cache: (layers, 2, B, A, slots, C) keys and values, to which new ones are appended.
         keys: (layers, B · A, panels, C, PANEL) copy of the keys, see `attention`.
         values: (layers, B · A, panels, slots, PANEL) copy of the values.
-        filled: Number of slots that `keys` and `values` hold already.
+        filled: Number of slots that are already copied to `keys` and `values`.
         mask: (T, start + T · times), 0 for slots that a row sees. Shape (0, 1) means that attention is causal.
         results: (times, 1, B · T), filled with the result of ARGMAX in each execution. For programs that draft a tree
             (times, 4, k²), filled by `branch`.
-        stop: Result of the first row after which to stop. Negative: execute the table until `end`.
+        stop: Stop after the execution whose result for the first row equals `stop`. Negative: execute until `end`.
     """
     rows, size = frames.shape
     tokens, memory, channels = len(positions), frames.ctypes.data, cache.shape[5]
@@ -547,7 +547,7 @@ def run(
     types.Tuple((_I[::1], _I[::1], types.boolean[:, ::1]))(_F[:, :, ::1], _I, _I), error_model="numpy", cache=True
 )
 def best(results, top_k, nodes):
-    """Choose the most probable nodes as EAGLE-2's tree. Of equally probable nodes it takes the first ones.
+    """Choose the most probable nodes as EAGLE-2's draft tree. Of equally probable nodes, the first ones are chosen.
 
     The chosen nodes form a tree, because a child is never more probable than its parent and comes after it.
 

@@ -94,7 +94,7 @@ class Matrix:
         columns: Size, number format and addresses of the matrix, as entries of an operation in the table of operations
             (see `recording.COLUMNS`).
         nbytes: Bytes of the weights.
-        blocked: The matrix in oneDNN's layout. It then has no panels. None for other matrices.
+        blocked: The matrix in oneDNN's layout, without panels. None: the matrix is stored in panels.
     """
 
     def __init__(self, weight: Tensor, bias: Tensor | None) -> None:
@@ -128,7 +128,7 @@ _MATRICES = WeakIdKeyDictionary()
 
 
 def matrix_of(weight: Tensor, bias: Tensor | None) -> Matrix:
-    """Return the `Matrix` of a linear layer. It is built once per weight tensor."""
+    """Return the `Matrix` of a linear layer. For each weight tensor, the matrix is built once."""
     if weight not in _MATRICES:
         _MATRICES[weight] = Matrix(weight.detach(), bias)
     found: Matrix = _MATRICES[weight]
@@ -136,12 +136,12 @@ def matrix_of(weight: Tensor, bias: Tensor | None) -> Matrix:
 
 
 def stored_bytes(tensors: Iterable[Tensor]) -> float:
-    """Return the bytes of memory that these weights take. Weights of a program count in its stored number format."""
+    """Return the bytes of memory that weights take. Compiled weights count as they are stored in their `Matrix`."""
     return float(sum(_MATRICES[x].nbytes if x in _MATRICES else x.nbytes for x in tensors))
 
 
 def forget(module: torch.nn.Module) -> None:
-    """Discard the stored matrices of a module, whose weights may have changed."""
+    """Discard the stored matrices of a module, because its weights may have changed."""
     for parameter in module.parameters():
         _MATRICES.pop(parameter, None)
 
@@ -163,7 +163,7 @@ class Program:
             function: Takes tensors and returns a tensor or a tuple of tensors. All of them are float32 in the program.
             shapes: Shape of each input. Its first dimension is 1 and stands for any number of rows.
             repeats: Whether `repeat` or `grow` will be called. Then output i of an execution becomes input i of the
-                next. There may be more outputs than inputs.
+                next execution. There may be more outputs than inputs.
         """
         tape = Tape()
         with torch.no_grad():
@@ -224,7 +224,7 @@ class Program:
             inputs: Inputs of the first execution, one token of each of B sequences.
             cache: Keys and values of earlier tokens. Each execution appends the keys and values of one more token, but
                 `cache.length` stays as it is.
-            end: Result of the first sequence after which to stop. None: execute the program `times` times.
+            end: Token after which to stop, in the results of the first sequence. None: execute `times` times.
 
         Returns:
             (executions, B) float32, the result of the ARGMAX operation in each execution.

@@ -143,7 +143,7 @@ class Recorded:
         return self.tape.emit(CHOOSE, (1, len(strict) + 1), [self, radius], self.shape[-1], strict)
 
     def attend(self, heads: int, cos: Tensor, sin: Tensor) -> Recorded:
-        """Record the attention of the next layer. Of this value's 3 E columns, E are queries, E keys and E values.
+        """Record the attention of the next layer. This value has 3 E columns: E of queries, E of keys, E of values.
 
         Args:
             heads: Number of attention heads, with C channels each. Together they have E channels.
@@ -165,7 +165,7 @@ class Tape:
     Attributes:
         ops: One dictionary per operation, with the names in COLUMNS as keys.
         numbers: Constant arrays, such as norm gains.
-        indices: Places that GATHER operations copy from.
+        indices: Indices in the frame that GATHER operations copy from.
         begins: The first place of every register. The last entry is where the next register will begin.
         cache: Three numbers for the cache: layers with attention, heads of a layer, channels of a head.
     """
@@ -196,7 +196,7 @@ class Tape:
 
         Args:
             code: What it computes, such as LINEAR.
-            out: Value that receives the result, or the shape of a new register for it.
+            out: Value that receives the result, or the shape of a new register for the result.
             inputs: Up to two values that the operation reads. The second one counts as a single row.
             width: Number of elements in each row of the first input.
             numbers: Constants that the operation reads, such as a norm's gain.
@@ -265,7 +265,7 @@ class Tape:
         Tensors that are never needed at the same time may share memory.
 
         Args:
-            kept: Inputs and outputs of the recorded function. They share memory with nothing.
+            kept: Inputs and outputs of the recorded function. They share memory with no other tensor.
 
         Returns:
             The size of a frame, as a number of float32 values.

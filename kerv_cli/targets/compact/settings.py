@@ -47,10 +47,10 @@ class TargetSettings:
 
 
 def prompt_tokens(target: Mapping[str, Any]) -> int | None:
-    """Return P, the number of prompt tokens of a compact or grown target. None for other families.
+    """Return P, the number of prompt tokens of a compact or grown target. None if the target is of another family.
 
     Args:
-        target: Content of its `target.json`.
+        target: Content of the target's `target.json`.
     """
     own = target.get("settings", {})
     if not {"grid", "instruction_tokens", "scene_tokens"} <= set(own):

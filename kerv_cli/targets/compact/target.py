@@ -3,11 +3,11 @@
 The prompt is [vision grid] [instruction] [scene] [proprioception]. The last prompt position predicts token 0. An image
 of several camera views gives one vision grid per view.
 
-Scene tokens encode the places: positions that the task is about, such as those of object and goal. They contain where
-each place is, and the vectors from the hand to it. With `observation=vision` these positions are estimated from the
-image. The estimate is trained on the simulator's positions, which are never read afterwards. With `observation=state`
-the simulator gives the positions, together with the rest of its state. Such a policy has privileged information. It
-serves to study decoding without perception.
+Scene tokens encode the *places*: the 3D positions that matter to the task, such as object and goal. They contain each
+place's position, the vector from the hand to it, and the vector from it to the next place. With `observation=vision`
+these positions are estimated from the image. The estimate is trained on the simulator's positions, which are never
+read afterwards. With `observation=state` the simulator gives the positions, together with the rest of its state. Such a
+policy has privileged information. It serves to study decoding without perception.
 
 Shapes: B observations, p and s numbers of proprioception and state, L words, K places, P prompt tokens, T new tokens, N
 tokens of a chunk, V action tokens, E width.
@@ -51,7 +51,7 @@ class Inputs:
     """A batch of B observations as tensors.
 
     Attributes:
-        images: (B, 3, size, size · views) uint8, all camera views side by side. None for a policy that reads the state.
+        images: (B, 3, size, size · views) uint8, all camera views side by side. None if the policy reads the state.
         proprioception: (B, p) float32, the robot's own measurements.
         states: (B, s) float32, the simulator's state. A policy that reads images ignores it.
         words: (B, L) int64, ids of the instruction's words.
@@ -68,8 +68,8 @@ class Programs(NamedTuple):
 
     Attributes:
         prompt: Program that encodes a prompt.
-        step: Program that reads tokens, and returns the most probable next tokens and the hidden states. It can be
-            repeated.
+        step: Program that reads a token, and returns the most probable next token and the hidden state. The next token
+            can become the next input, so that one call of `Program.repeat` decodes several tokens.
     """
 
     prompt: Program
@@ -87,22 +87,23 @@ class CompactTarget(Compilable):
         actions: Action space.
         observation: Observation space.
         words: Vocabulary of instructions.
-        camera: Name of the camera. A name that joins several views with `+` means one image of all views.
+        camera: Name of the camera. Names that are joined with `+` stand for one image of several camera views.
 
     Attributes:
         cameras: One name: the camera whose images are read. Empty if the policy reads the state.
         frame_shape: Shape (height, width, 3) of an image.
         segments: Positions of the tokens in each part of the prompt (a slice), by the part's name.
-        sha256: Hash of the weights that were loaded. Empty if none were.
-        chunk: H, number of control steps that it was trained to decode at once.
-        parallel: Whether it decodes all tokens in one forward (`parallel_pass`), and cannot decode them one by one.
+        sha256: Hash of the weights that were loaded. Empty if no weights were loaded.
+        chunk: H, number of control steps that the policy was trained to decode at once.
+        parallel: Whether the policy decodes all tokens in one forward (`parallel_pass`). It then cannot decode single
+            tokens.
         width: E, width of the embeddings and hidden states.
         heads: Number of attention heads of a layer, also in a drafter's layers.
         feed_forward: Number of hidden units of a layer, also in a drafter's layers.
-        enlarges: Function that enlarges a drafter, if the target was enlarged together with one (docs/methods.md §0.2).
-            None for any other target.
+        enlarges: Function that enlarges a drafter, if drafters are enlarged together with this target (docs/methods.md
+            §0.2). None: drafters stay as they are.
         hand_and_object: Positions (3,) in metres of the hand and the object in the last observation that `encode` read.
-            A vision policy estimates the object's position. None: nothing was read.
+            A vision policy estimates the object's position. None: `encode` has read no observation yet.
     """
 
     centre: Tensor
@@ -165,7 +166,8 @@ class CompactTarget(Compilable):
     def pooled(self, prompt: Tensor) -> Tensor:
         """Pool prompts (B, P, E) into fixed vectors (B, F).
 
-        A vector holds the scene tokens, the proprioception, the mean word and, if there are any, the mean vision token.
+        A vector holds the scene tokens, the proprioception token, the mean of the word tokens, and for a vision policy
+        the mean of the vision tokens.
         """
         parts = self.segments
         pooled = [prompt[:, parts["scene"]].flatten(1), prompt[:, parts["proprioception"]].flatten(1)]
@@ -245,7 +247,7 @@ class CompactTarget(Compilable):
         """Encode a batch of observations.
 
         Returns:
-            Prompts (B, P, E), and the positions (B, K, 3) in metres of the places, such as object and goal.
+            Prompts (B, P, E), and the 3D positions (B, K, 3) in metres of the task's places, such as object and goal.
         """
         given = [inputs.words, inputs.proprioception, inputs.states]
         if self.cameras:
@@ -259,7 +261,7 @@ class CompactTarget(Compilable):
         return self.prompt(*given)
 
     def prompt(self, words: Tensor, proprioception: Tensor, *seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute prompts and positions of the places, as `encode_batch` returns them, in torch.
+        """Compute what `encode_batch` returns, in torch: prompts, and 3D positions of object, goal and so on.
 
         While a program is recorded, all arguments are `Recorded`, stand-ins for tensors.
 
@@ -284,11 +286,11 @@ class CompactTarget(Compilable):
         return torch.cat([*parts, embedded, scene, felt], 1), places
 
     def located(self, points: Tensor, hand: Tensor, words: Tensor) -> Tensor:
-        """Estimate the positions (B, K, 3) of the places in metres.
+        """Estimate the 3D positions (B, K, 3) of the task's places (object, goal, …) in metres.
 
         Args:
             points: (B, 2 · keypoints · views) image points.
-            hand: (B, p) hand features.
+            hand: (B, p) result of `hand_features`.
             words: (B, L, E) embedded words.
         """
         # bfloat16 would round image points to a fifth of a cell: millimetres matter here
@@ -298,7 +300,10 @@ class CompactTarget(Compilable):
         return located.to(torch.float32).unflatten(-1, (-1, 3)) * 0.1 + self.centre
 
     def new_program(self) -> Programs | None:
-        """Return compiled programs that encode a prompt and decode tokens. None for a format without kernels."""
+        """Return compiled programs that encode a prompt and decode tokens.
+
+        None if no compiled kernels exist for the weights' number format.
+        """
         if self.dtype not in FORMATS:
             return None
         s, space = self.settings, self.observation
@@ -321,7 +326,8 @@ class CompactTarget(Compilable):
         Args:
             function: The function. Its inputs are float32 tensors of batch size 1.
             shapes: Shape of each input.
-            repeats: Whether the outputs of one call can be the inputs of the next call.
+            repeats: Whether the program can run several times in one call. The outputs of each run are the inputs of
+                the next, to decode or draft several tokens.
 
         Returns:
             The compiled program. None if the target is not compiled.
@@ -362,7 +368,7 @@ class CompactTarget(Compilable):
         Args:
             token: The last token, not yet in the cache.
             count: Number of tokens to decode.
-            cache: Keys and values of all tokens before `token`. It grows by the number of decoded tokens.
+            cache: Keys and values of all tokens before `token`. The cache grows by the number of decoded tokens.
             end: Token after which to stop. None: decode all `count` tokens.
 
         Returns:
@@ -383,10 +389,10 @@ class CompactTarget(Compilable):
             tokens: The new tokens (T,) int64.
             positions: (T,) rotary positions of the new tokens.
             cache: Keys and values of earlier tokens. This forward appends the new ones.
-            seen: (T, M) bool, which of the last M tokens each new token attends to. None: attention is causal.
+            seen: (T, M) bool, which of the last M tokens, old or new, each new token attends to. None: causal mask.
 
         Returns:
-            The most probable token after each new token, (T,) int64, and their hidden states (1, T, E).
+            The most probable token after each new token, (T,) int64, and the hidden states (1, T, E) of the new tokens.
         """
         if self.compiled is None or cache.fixed:
             hidden = self(self.embed(tokens[None]), positions, cache, seen)
@@ -403,7 +409,7 @@ class CompactTarget(Compilable):
 
         Args:
             prompt: (B, P, E).
-            cache: An empty cache, to be filled. None: compute without a cache.
+            cache: An empty cache, which this call fills. None: compute without a cache.
         """
         x = torch.cat([prompt, self.queries.to(prompt.dtype).expand(len(prompt), -1, -1)], 1)
         visible = np.tri(x.shape[1], dtype=bool)
@@ -418,7 +424,7 @@ class CompactTarget(Compilable):
             tokens: (B, N) the true tokens. A parallel target does not read them.
 
         Returns:
-            Logits (B, N, V), and the positions (B, K, 3) in metres of the places, such as object and goal.
+            Logits (B, N, V), and the 3D positions (B, K, 3) in metres of the task's places, such as object and goal.
         """
         prompt, places = self.encode_batch(inputs)
         if self.parallel:

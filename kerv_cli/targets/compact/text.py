@@ -20,7 +20,7 @@ class WordTokenizer:
     """A fixed vocabulary of whole words.
 
     Attributes:
-        words: `words[i]` has id i + 2. Id 0 is padding, id 1 an unknown word.
+        words: The known words. `words[i]` has id i + 2. Id 0 is padding, id 1 stands for any unknown word.
     """
 
     words: tuple[str, ...]
@@ -32,7 +32,7 @@ class WordTokenizer:
 
     @property
     def size(self) -> int:
-        """Number of ids: one per word, padding and unknown."""
+        """Number of ids: one per word, one for padding, and one for unknown words."""
         return len(self.words) + 2
 
     @cached_property

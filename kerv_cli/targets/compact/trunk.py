@@ -112,7 +112,7 @@ class LayerStack(Compilable):
 
     @property
     def weight(self) -> Tensor:
-        """Any one weight: it has the device and the number format of all."""
+        """One of the weights. All weights have the same device and number format."""
         return next(self.parameters())
 
     def enter(self, *inputs: Tensor) -> Tensor:
@@ -120,12 +120,12 @@ class LayerStack(Compilable):
         return inputs[0]
 
     def begin(self, *inputs: Tensor) -> Tensor:
-        """Return the first layer's input (B, T, width): the combined inputs (B, T, E), then channels of zeros."""
+        """Return the first layer's input (B, T, width): the combined inputs (B, T, E), padded with zeros."""
         x, rest = self.enter(*inputs), self.width - self.outer
         return x if not rest else torch.cat([x, x[..., :1].expand(*x.shape[:-1], rest) * 0.0], -1)
 
     def finish(self, x: Tensor) -> Tensor:
-        """Cut the last layer's output (B, T, width) to its first E channels and apply the final norm: hidden states."""
+        """Return the hidden states (B, T, E): cut x (B, T, width) to its first E channels, and apply the final norm."""
         return self.norm(x if self.width == self.outer else x[..., : self.outer])
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
@@ -144,7 +144,10 @@ class LayerStack(Compilable):
         return CapturedCache(*sizes, like) if fixed else Cache(*sizes, like)
 
     def new_program(self) -> Program | None:
-        """Compile the stack for a CPU. `compile_parts` calls this. Returns None for a number format without kernels."""
+        """Return the stack as a compiled `Program`, for `compile_parts`.
+
+        None if no compiled kernels exist for the weights' number format.
+        """
         compiles = self.weight.dtype in FORMATS
         return Program(self.recorded, *[(1, 1, self.outer)] * self.inputs) if compiles else None
 
@@ -157,7 +160,7 @@ class LayerStack(Compilable):
             inputs: Tensors (B, T, E), as `enter` takes them.
             positions: (T,) rotary positions of the new tokens.
             cache: Keys and values of earlier tokens. This forward appends the new ones. None: no earlier tokens.
-            seen: (T, M) bool, which of the last M tokens each new token attends to. None: attention is causal.
+            seen: (T, M) bool, which of the last M tokens, old or new, each new token attends to. None: causal mask.
         """
         tokens, padding = inputs[0].shape[1], 0 if cache is not None and cache.length else self.padding
         if padding:
@@ -234,6 +237,6 @@ class Trunk(LayerStack):
             x: (B, T, E) embeddings of the new tokens.
             positions: (T,) rotary positions of the new tokens.
             cache: Keys and values of earlier tokens. This forward appends the new ones. None: no earlier tokens.
-            seen: (T, M) bool, which of the last M tokens each new token attends to. None: attention is causal.
+            seen: (T, M) bool, which of the last M tokens, old or new, each new token attends to. None: causal mask.
         """
         return self.run((x,), positions, cache, seen)

@@ -47,7 +47,7 @@ class VisionEncoder(Compilable):
         size: Pixels per side of the image.
         grid: Vision tokens per side.
         keypoints: K, number of image points.
-        channels: Channels of the first stage. The second has twice, the third four times as many.
+        channels: Channels of the first stage. The second stage has twice as many, the third four times as many.
         width: E, width of a vision token.
         norm: Norm of the residual blocks, `group` or `instance`.
     """
@@ -74,7 +74,7 @@ class VisionEncoder(Compilable):
         return PackedVision(self, 2 * len(self.columns)) if self.columns.dtype == torch.float32 else None
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """Return vision tokens (B, grid², E) and image points (B, 2K) in [-1, 1] of images (B, 3, size, size) uint8."""
+        """Map images (B, 3, size, size) uint8 to vision tokens (B, grid², E) and image points (B, 2K) in [-1, 1]."""
         if self.compiled is not None and len(images) == 1:
             tokens, points = self.compiled(images)
             return tokens, points
@@ -139,5 +139,5 @@ class PackedVision:
         return type(None), ()
 
     def __call__(self, images: Tensor) -> list[Tensor]:
-        """Return the vision tokens (1, grid², E) and K image points (1, 2K) of an image (1, 3, size, size) uint8."""
+        """Map an image (1, 3, size, size) uint8 to vision tokens (1, grid², E) and K image points (1, 2K)."""
         return [torch.from_numpy(found) for found in self.session.run(None, {"frame": images.numpy()})]

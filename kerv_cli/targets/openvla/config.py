@@ -82,7 +82,7 @@ class Language:
 
     @property
     def key_value_heads(self) -> int:
-        """Number of heads of keys and values. Several query heads may share one."""
+        """Number of heads of keys and values. Several query heads may share a head of keys and values."""
         return self.num_key_value_heads or self.num_attention_heads
 
     @property
@@ -165,8 +165,8 @@ class Bounds:
     Attributes:
         q01: 1st percentile of the actions.
         q99: 99th percentile of the actions.
-        mask: Which DoFs are normalised with the percentiles. The others, such as the gripper, are not normalised. None:
-            all DoFs are normalised.
+        mask: Whether each DoF is normalised with the percentiles. A gripper, for example, is not. None: all DoFs are
+            normalised.
     """
 
     q01: tuple[float, ...]

@@ -68,7 +68,8 @@ def read_normalisations(folder: Path) -> tuple[Normalisation, Normalisation]:
 def cropped(image: np.ndarray, size: int) -> np.ndarray:
     """Crop an image (h, w, 3) uint8 to the central 90 % of its area, and resize it to (size, size, 3) uint8.
 
-    This equals TensorFlow's crop_and_resize: bilinear interpolation, the outermost pixels are on the crop's edges.
+    This equals TensorFlow's crop_and_resize: interpolation is bilinear, and the outermost pixels are on the crop's
+    edges.
     """
     axis = math.sqrt(CROPPED_AREA) * torch.linspace(-1, 1, size)  # -1 and 1 are the centres of the outermost pixels
     grid = torch.stack(torch.meshgrid(axis, axis, indexing="xy"), -1)[None]
@@ -99,7 +100,7 @@ def pixels_of(
     Args:
         image: (h, w, 3) uint8.
         shape: Shapes of the checkpoint.
-        normalisations: One per tower.
+        normalisations: Normalisation of the pixels for each tower.
         crop: Whether to crop the image to its central 90 %.
         libero: Whether to apply `as_in_libero` first.
 

@@ -139,7 +139,7 @@ class Reference:
         return x
 
     def prompt(self, pixels: Tensor, ids: list[int]) -> Tensor:
-        """Return the prompt (1, P, E) of an image and a text's ids."""
+        """Return the prompt (1, P, E) for an image (1, 6, s, s) and the ids of a text."""
         words = self.llama.model.embed_tokens(torch.tensor([ids], device=self.device))
         return torch.cat([words[:, :1], self.patches(pixels), words[:, 1:]], 1)
 
@@ -180,7 +180,7 @@ def _block(state: Mapping[str, Tensor], block: str, names: Mapping[str, str]) ->
 
 
 def parity(target: Any) -> dict[str, float]:
-    """Decode sample observations, and compare each token and its logits with what transformers computes.
+    """Decode sample observations, and compare each token and its logits with those of the transformers package.
 
     Both compute the logits of a token after the same prompt and the same earlier tokens.
 
@@ -192,8 +192,8 @@ def parity(target: Any) -> dict[str, float]:
 
         - Tokens that were compared.
         - Tokens that differ from transformers' most probable action token.
-        - Tokens among these whose two largest logits are equal in bfloat16.
-        - All tokens whose two largest logits are equal in bfloat16.
+        - Of the differing tokens, those whose two largest logits are equal in bfloat16.
+        - Of all compared tokens, those whose two largest logits are equal in bfloat16.
         - Tokens for which transformers' most probable id is not an action token.
         - Largest difference of two logits.
 

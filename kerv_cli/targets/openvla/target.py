@@ -94,9 +94,9 @@ class OpenVLATarget:
 
     @property
     def segments(self) -> Mapping[str, slice]:
-        """Positions of the tokens in each part of the prompt (a slice), by the part's name.
+        """Map from the name of each part of the prompt to the positions of its tokens (a slice).
 
-        The slice of the instruction has no end, because the length of instructions differs.
+        The instruction's slice has no end, because instructions differ in length.
         """
         patches = self.shape.patches
         return {"begin": slice(0, 1), "vision": slice(1, 1 + patches), "instruction": slice(1 + patches, None)}
@@ -107,7 +107,7 @@ class OpenVLATarget:
         return 2 * self.width
 
     def pooled(self, prompt: Tensor) -> Tensor:
-        """Pool prompts (B, P, E) into vectors (B, F): the mean vision patch, then the mean text token."""
+        """Pool each prompt (B, P, E) into one vector (B, F): the mean vision token, then the mean text token."""
         return torch.cat([prompt[:, self.segments[name]].mean(1) for name in ("vision", "instruction")], -1)
 
     def encode(self, observation: Observation) -> Tensor:
@@ -157,7 +157,7 @@ class OpenVLATarget:
             x: (B, T, E) embeddings of the new tokens.
             positions: (T,) rotary positions of the new tokens.
             cache: Keys and values of earlier tokens. This forward appends the new ones. None: no earlier tokens.
-            seen: (T, M) bool, which of the last M tokens each new token attends to. None: attention is causal.
+            seen: (T, M) bool, which of the last M tokens, old or new, each new token attends to. None: causal mask.
         """
         return self.model.language_model.model(x, positions, cache, seen)
 

@@ -122,7 +122,7 @@ def run_layers(
         x: (B, T, E) embeddings of the new tokens.
         positions: (T,) rotary positions of the new tokens.
         cache: Keys and values of earlier tokens. This forward appends the new ones. None: no earlier tokens.
-        seen: (T, M) bool, which of the last M tokens each new token attends to. None: attention is causal.
+        seen: (T, M) bool, which of the last M tokens, old or new, each new token attends to. None: causal mask.
         mask: Additive mask to use instead of `seen`. None: the mask is made from `seen`.
     """
     rotary = rotation(positions, language.channels, language.rope_theta, x.dtype)
@@ -175,7 +175,7 @@ class Int8Linear(nn.Module):
     scale: Tensor
 
     def __init__(self, weight: Tensor, dtype: torch.dtype) -> None:
-        """Round weights to int8. In each row 127 stands for the largest absolute value.
+        """Round weights to int8. In each row, 127 stands for the row's largest absolute value.
 
         Args:
             weight: (outputs, inputs) floats.

@@ -21,7 +21,7 @@ EPSILON = 1e-6  # of every layer norm
 
 
 def named(**layers: nn.Module) -> nn.Sequential:
-    """Return the layers in sequence. The weights of a layer get the name of its argument."""
+    """Return the layers in sequence. Each keyword names its layer, and so the layer's weights."""
     return nn.Sequential(OrderedDict(layers))
 
 
