@@ -8,16 +8,16 @@
     heisd                       HeiSD: retrieved drafts, a boundary between two drafters, skipped verification
     jacobi, parallel            decoding as in PD-VLA and in OpenVLA-OFT
     lookup                      prompt lookup in the last chunk's tokens
-    motion                      ours: acceptance and stopping by the motion that a code of a whole chunk stands for
+    motion                      ours: acceptance and stopping for FAST tokens, by the motion that they stand for
     early, merged               ours: drafts from the prompt, before the prefill (`method=one_pass`)
     scout                       ours: a drafter with its own vision encoder
     streak                      ours: drafts that are executed without verification
-    certified                   ours: such drafts, on tasks for which a certificate limits the loss of success
+    certified                   ours: unverified drafts, on tasks for which a certificate limits the loss of success
     sp_vla                      SP-VLA: a regression replaces the target while the motion is fast
 
-Each file above, and the `__init__.py` of each folder, contains the parts of its family, with their settings. It imports
-neither torch nor numpy when it is loaded. A drafter's network, and whatever else needs them, is in a file of its own,
-which is imported when the part is built.
+Each file above, and the `__init__.py` of each folder, contains the parts of its family, with their settings. Importing
+these files imports neither torch nor numpy. Code that needs torch or numpy, such as a drafter's network, is in another
+file, which is imported when the part is built.
 
 *Ours* marks what comes from no paper.
 

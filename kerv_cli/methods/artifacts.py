@@ -36,7 +36,7 @@ _LOADED: dict[tuple[Any, ...], Any] = {}
 class Use:
     """What a policy's artifacts will be used for.
 
-    Each artifact checks that it was made for such a use, before any weights are loaded.
+    Before any weights are loaded, each artifact checks that it was made for this use.
 
     Args:
         method: Settings of the method's parts, by the kind of the part, such as `proposer`.
@@ -91,11 +91,11 @@ class MadeFor:
 
 
 def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str, again: str) -> None:
-    """Refuse an artifact that was made from another version of an artifact than the policy uses.
+    """Refuse an artifact that was made from other versions of the policy's target or artifacts.
 
     Args:
-        sources: Hashes of the artifacts from which it was made, by kind. Kinds that the policy does not use are
-            ignored.
+        sources: Hashes of the artifacts from which the artifact was made, by kind. Kinds that the policy does not use
+            are ignored.
         used: Hashes of the policy's target and artifacts, by kind.
         what: Beginning of the error message, such as `the early drafter in FOLDER was trained`.
         again: What the user should do, for the error message, such as `run 'kerv calibrate' again`.
@@ -110,21 +110,21 @@ def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str
 
 
 def removal(kind: str, path: Path) -> str:
-    """Return text for an error message: how to remove the artifact in `path`, to make room for a new one."""
+    """Return the part of an error message that says how to remove the artifact in `path` before a new one is made."""
     return f"remove it with 'kerv runs rm {kind}/{path.name}'" if path.parent.name == kind else f"move {path} aside"
 
 
 class Artifact(Generic[T]):
     """Base class of the kinds of artifacts, such as drafter, datastore and calibration.
 
-    An artifact consists of files that methods read. It is made for one target. A JSON file, in the format of the
-    dataclass `schema`, describes it. Its other files are beside the JSON file. Drafters with weights derive from the
-    subclass `TrainableDrafter` (`drafters.py`).
+    An artifact is made for one target. It consists of files that methods read. One of these is a JSON file with the
+    fields of the dataclass `schema`, which describes the artifact. Drafters with weights derive from the subclass
+    `TrainableDrafter` (`drafters.py`).
 
     Attributes:
         kind: Name of the kind in settings and paths, such as `drafter`.
         noun: Name of the kind in messages, such as `early drafter`.
-        made: How it is made, in messages, such as `trained`.
+        made: How such an artifact is made, in messages, such as `trained`.
         command: Command-line arguments after `kerv` that make such an artifact. Empty if no command makes it.
         schema: Dataclass of the description.
     """
@@ -137,11 +137,11 @@ class Artifact(Generic[T]):
 
     @property
     def again(self) -> str:
-        """Text for error messages: how to make such an artifact."""
+        """Part of error messages that says how to make such an artifact."""
         return f"run 'kerv {' '.join(self.command)}'"
 
     def anew(self, path: Path) -> str:
-        """Return text for error messages: how to replace the artifact in `path`, which belongs to another target."""
+        """Return the part of error messages that says how to replace an artifact of another target in `path`."""
         return self.again
 
     def path(self, results: str, name: str | None, target: Path) -> Path:
@@ -155,7 +155,7 @@ class Artifact(Generic[T]):
         return artifact_or_path(results, self.kind, name) if name else beside(target, self.kind)
 
     def json(self, path: Path) -> Path:
-        """Return the path of the description of the artifact in `path`."""
+        """Return the path of the JSON file that describes the artifact in `path`."""
         return path / f"{self.kind}.json"
 
     def load(self, path: Path, artifacts: Artifacts) -> Any:
@@ -178,7 +178,7 @@ class Artifact(Generic[T]):
         return {}
 
     def needs(self, description: T) -> tuple[str, ...]:
-        """Return the kinds of further artifacts that a method needs if it uses this one."""
+        """Return the kinds of the other artifacts that a method needs if it uses this artifact."""
         return ()
 
     def check_use(self, description: T, use: Use) -> None:
@@ -186,7 +186,7 @@ class Artifact(Generic[T]):
 
         Raises:
             UsageError: The artifact was made for another method, environment, camera or horizon.
-            CheckpointError: Something that the method reads is missing in the artifact.
+            CheckpointError: The artifact lacks something that the method reads.
         """
 
     def is_complete(self, description: T, kinds: Collection[str]) -> bool:
@@ -270,7 +270,7 @@ class Artifacts:
         return kind_of(kind).path(self.results, self.policy.artifacts.get(kind), beside)
 
     def new(self, kind: str, adds: bool = False) -> Path:
-        """Return the path to write the policy's artifact of this kind to.
+        """Return the path to which a command writes the policy's artifact of this kind.
 
         Args:
             kind: Kind of the artifact.

@@ -29,7 +29,7 @@ class Demonstrations:
 
     Attributes:
         sha256: Hash of the demonstrations.
-        tasks: For each task the number of episodes, as {"training": 50}.
+        tasks: Number of episodes of each task. For example, {"training": 50} stands for 50 training episodes.
     """
 
     sha256: str
@@ -43,7 +43,7 @@ class Variability:
     Attributes:
         k_s: Reference level K_S: the median K over the decodes that were measured, in normalised action units.
         decodes: Number of decodes that were measured.
-        levels: Median of K for every way to compute it, by the name of the `Measure`. The median for `MEAN` is `k_s`.
+        levels: Median of K for each way to compute K, by the name of the `Measure`. The median for `MEAN` is `k_s`.
             Empty in calibrations before version 1.1.
     """
 
@@ -54,7 +54,10 @@ class Variability:
 
 @dataclass(frozen=True)
 class BoundarySection:
-    """Ranges by which the hybrid boundary scales a path's radius of curvature and length (docs/methods.md §4.4).
+    """Ranges of the hand's path in the demonstrations: of its radius of curvature and its length.
+
+    HeiSD's boundary chooses between retrieval and the drafter (docs/methods.md §4.4). It scales the radius and the
+    length of the robot's own path to [0, 1] by these ranges.
 
     Attributes:
         episodes: Number of episodes that were measured.
@@ -74,14 +77,14 @@ class SkipLevel:
     episodes of the datastore. A neighbour is good if its chunk is close to the entry's chunk (`SkipSection.epsilon`).
 
     Attributes:
-        s_min: A chunk is executed without verification if its similarity is at least this.
-        low: Lowest value that `s_min` may reach if it is changed after each episode (success or failure).
-        high: Highest value that it may reach.
-        share: Share of the entries whose best neighbour reaches `s_min`.
+        s_min: A chunk is executed without verification if its similarity is at least `s_min`.
+        low: Lowest allowed value of `s_min`, if the skip rule changes `s_min` after each episode.
+        high: Highest allowed value of `s_min`, in the same case.
+        share: Share of the entries whose best neighbour has a similarity of at least `s_min`.
         entries: Number of entries that were looked up.
-        within: Share of good neighbours among those that reach `s_min`. None: none reaches it.
+        within: Share of good neighbours among the neighbours that reach `s_min`. None: no neighbour reaches `s_min`.
         error: Mean absolute error of the chunks of the neighbours that reach `s_min`, in normalised action units. None:
-            none reaches it.
+            no neighbour reaches `s_min`.
     """
 
     s_min: float
@@ -121,9 +124,9 @@ class Calibration:
         window: Number of control steps of history that a predictor sees.
         noise: Noise of each Kalman filter per DoF, by the filter's name (`kalman`, `damped`).
         variability: Typical kinematic variability K of each task, with its reference level K_S.
-        boundary: Ranges by which the hybrid boundary scales a path's radius of curvature and length.
+        boundary: Ranges of the hand's path, by which HeiSD's boundary scales radius of curvature and path length.
         skip: Thresholds at which verification is skipped.
-        provenance: How it was made.
+        provenance: How the calibration was made.
     """
 
     target: MadeFor
@@ -166,7 +169,7 @@ class Calibration:
         return row.levels.get(measure.name, row.k_s)
 
     def ranges(self, window: int) -> BoundaryRanges:
-        """Return the ranges of the path's radius of curvature and length, for a boundary that sees `window` positions.
+        """Return the ranges of radius of curvature and path length, for a boundary that sees `window` positions.
 
         Raises:
             CheckpointError: No ranges were measured for this window.
@@ -182,9 +185,9 @@ class Calibration:
         return windows[str(window)]
 
     def skip_levels(self, task: str, datastore: str) -> tuple[float, float, float]:
-        """Return (low, s_min, high): the similarity s_min at which the task skips verification, and its bounds.
+        """Return (low, s_min, high). From the similarity s_min on, the task skips verification.
 
-        A skip rule may change s_min after each episode, within the bounds. If the task never skips, all three are
+        A skip rule may change s_min after each episode, between low and high. If the task never skips, all three are
         NEVER, which is above every similarity.
 
         Args:
@@ -207,14 +210,14 @@ class Calibration:
 
 
 class CalibrationArtifact(Artifact[Calibration]):
-    """The kind of artifact `calibration`. It is a single file. The paths of this class are paths of the file."""
+    """The kind of artifact `calibration`. It is a single file, and every `path` here is the path of that file."""
 
     kind = noun = "calibration"
     made, command = "made", ("calibrate",)
     schema = Calibration
 
     def path(self, results: str, name: str | None, target: Path) -> Path:
-        """Return the path of the calibration with this name. Without a name, return the path of the target's own.
+        """Return the path of the calibration with this name. Without a name, take the one beside the target.
 
         A shipped calibration is `pretrained/<name>/calibration.json`. One made by `kerv calibrate` is
         `artifacts/calibration/<name>/calibration.json`.
@@ -226,11 +229,13 @@ class CalibrationArtifact(Artifact[Calibration]):
         return super().path(results, name, target) / FILE
 
     def json(self, path: Path) -> Path:
-        """Return `path`, which is the file of the description."""
+        """Return `path`, because a calibration is its own description."""
         return path
 
     def check_use(self, description: Calibration, use: Use) -> None:
-        """Refuse a method that reads a number which was not measured: K_S of a task, or the quantiles of F.
+        """Refuse a method that reads a number that was not measured.
+
+        A threshold may read K_S of a task (docs/methods.md §3.2). A boundary may read the quantiles of F (§4.4).
 
         Raises:
             CheckpointError: The number was not measured.
@@ -243,9 +248,10 @@ class CalibrationArtifact(Artifact[Calibration]):
                 description.k_s(task, threshold.measure)
 
     def is_complete(self, description: Calibration, kinds: Collection[str]) -> bool:
-        """Return whether everything was measured that a policy with artifacts of these `kinds` needs.
+        """Return whether the calibration holds all numbers that a policy with artifacts of these `kinds` needs.
 
-        With a drafter this is the reference level K_S, with a datastore the thresholds for skipping verification.
+        With a drafter, the reference levels K_S are needed. With a datastore, the thresholds s_min for skipping
+        verification are needed.
         """
         sections = {"drafter": description.variability, "datastore": description.skip}
         return all(section for kind, section in sections.items() if kind in kinds)

@@ -29,16 +29,16 @@ class ContactThresholdSettings(RadiusRange):
 class Contact(Threshold):
     """The acceptance radius r grows linearly from r_min at the object to r_max at the distance `near` and beyond.
 
-    The distance from hand to object is the policy's estimate from the last observation that it encoded, in an earlier
-    decode. The first decode of an episode uses r_min.
+    The policy itself estimates the distance from hand to object, whenever it encodes an observation. The last estimate
+    is used, which comes from an earlier decode. The first decode of an episode uses r_min.
     """
 
     def __init__(self, settings: ContactThresholdSettings, context: Context) -> None:
         """Read the settings.
 
         Raises:
-            UsageError: The policy estimates no positions. Or the largest radius is larger than the distance of any two
-                tokens.
+            UsageError: The policy estimates no positions. Or the largest radius is larger than the largest distance
+                between two tokens.
         """
         context.check_radius("r_max", settings.r_max)
         if not hasattr(context.target, "hand_and_object"):

@@ -35,7 +35,7 @@ class DrafterDescription(checkpoint.Description):
         actions: The target's action space.
         chunk: The target's number of control steps per chunk. 0: the drafter works with any number.
         settings: Settings of the drafter's shapes and training.
-        provenance: How it was made.
+        provenance: How the drafter was made.
     """
 
     target: str
@@ -64,7 +64,7 @@ class Decodes(Rows):
 
 
 def evenly(steps: np.ndarray, share: float) -> np.ndarray:
-    """Return a share of the steps (n,), evenly spread. The first step is always included."""
+    """Return evenly spread steps: the given share of `steps` (n,). The first step is always included."""
     order = np.arange(len(steps))
     return steps[np.ceil((order + 1) * share - 1e-9) > np.ceil(order * share - 1e-9)]
 
@@ -177,9 +177,9 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         """
 
     def anew(self, path: Path) -> str:
-        """Return text for error messages: how to replace the drafter in `path`, which belongs to another target.
+        """Return the part of error messages that says how to replace a drafter of another target in `path`.
 
-        The drafter must be removed first, because a training resumes only for its own target.
+        The user must remove the old drafter first, because a training can only be resumed for its own target.
         """
         return f"{removal(self.kind, path)}, then {self.again}"
 

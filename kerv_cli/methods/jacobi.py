@@ -66,8 +66,8 @@ class JacobiProposer(ChainProposer):
             chunk: The chunk that is decoded.
             first: Index in the chunk of the token just before this round's tokens.
             hidden: Not used.
-            target_tokens: The target's prediction after token `first`, then after each token of the guess, rejected
-                ones included.
+            target_tokens: The target's prediction after token `first`, then after each token of the guess, also
+                after rejected tokens.
         """
         accepted = len(chunk.tokens) - first - 2
         self.guess = [*target_tokens[accepted + 1 :], *self.guess[len(target_tokens) - 1 :]]

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class LookupProposerSettings:
-    """Draft what followed in the last chunk after the newest tokens."""
+    """Search the last chunk for the newest committed tokens, and draft the tokens that followed there."""
 
     kind: str = "lookup"
     longest: int = number(3, 1, MOST_TOKENS)  # number of newest tokens that are searched for; if not found, fewer
@@ -23,11 +23,11 @@ class LookupProposerSettings:
 
 @ProposerPart("lookup", LookupProposerSettings, colour=0xB5651D, when=PREFILL, chains=True, any_code=True)
 class LookupProposer(ChainProposer):
-    """Drafts the tokens that followed the newest committed tokens in the last chunk.
+    """Searches the last chunk for the newest committed tokens, and drafts the tokens that followed there.
 
-    It searches for the newest `longest` tokens, then for fewer. If not even the newest one occurs, or before the
-    prefill, it drafts the last chunk's tokens from the same index on. Of several places, the one nearest to this index
-    wins.
+    The newest `longest` tokens are searched for, then fewer of them. If they occur several times, the occurrence
+    nearest to the current index in the chunk wins. If not even the newest token occurs, or before the prefill, the
+    draft is the last chunk's tokens from the current index on.
     """
 
     name = "lookup"
@@ -36,7 +36,7 @@ class LookupProposer(ChainProposer):
         self.longest = settings.longest
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return one chain of at most `depth` tokens. It is empty in an episode's first chunk."""
+        """Return one chain of at most `depth` tokens. The chain is empty in an episode's first chunk."""
         last, tokens = chunk.situation.last, chunk.tokens
         for size in range(min(self.longest, len(tokens)), 0, -1):
             places = [place for place in range(size, len(last)) if last[place - size : place] == tokens[-size:]]

@@ -95,7 +95,10 @@ class MergedProposer(ChainProposer):
             source.reset()
 
     def similarity(self, chunk: Chunk) -> float | None:
-        """Return the similarity that a source found in a datastore. None if no source searched one."""
+        """Return the cosine of the most similar stored entry that one of the proposers found in its datastore.
+
+        Return None if no proposer searched a datastore for this chunk.
+        """
         found = [source.similarity(chunk) for source in (*self.sources, *self.fallback)]
         return next((value for value in found if value is not None), None)
 

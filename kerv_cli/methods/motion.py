@@ -1,4 +1,4 @@
-"""Acceptance and stopping by the motion that tokens of a code stand for (*ours*; docs/methods.md §6)."""
+"""Accept FAST tokens, and stop decoding, by the motion that the tokens stand for (*ours*; docs/methods.md §6)."""
 
 from __future__ import annotations
 
@@ -23,10 +23,14 @@ if TYPE_CHECKING:
 
 
 def code_of(context: Context, part: str) -> FastCode:
-    """Return the code of the target's chunks.
+    """Return the target's FAST code, which turns tokens into the motion of a whole chunk.
+
+    Args:
+        context: The context in which a part is built.
+        part: The setting that needs a FAST code, such as `boundary=coarse`, for the error message.
 
     Raises:
-        UsageError: Each of the target's tokens stands for one number. `part` names the setting that needs a code.
+        UsageError: The target has no FAST code. Each of its tokens stands for one number.
     """
     code = context.target.actions.code
     if code is None:
@@ -36,7 +40,7 @@ def code_of(context: Context, part: str) -> FastCode:
 
 @dataclass
 class MotionAcceptanceSettings:
-    """Accept a draft token if the chunk's motion with it is close to the motion with the target's token."""
+    """Accept a draft token if the chunk's motion is nearly the same as with the target's token."""
 
     kind: str = "motion"
     tolerance: float = number(0.1, 0, 2)  # largest difference of an action in the chunk, normalised units
@@ -45,10 +49,10 @@ class MotionAcceptanceSettings:
 @AcceptancePart("motion", MotionAcceptanceSettings, reads_threshold=False, any_code=True)
 @dataclass(frozen=True)
 class MotionRule(DistanceRule):
-    """Accepts a draft token if the motion after it differs little from the motion after the target's token.
+    """Accepts a draft token if the chunk's motion is nearly the same as with the target's token.
 
-    Both motions are decoded from the committed tokens, the accepted draft tokens before, and the token. Coefficients
-    that are still missing count as zero. The largest difference of an action in the chunk must be within `tolerance`.
+    Each of the two motions is decoded from the committed tokens, the accepted draft tokens, and one of the two tokens.
+    Coefficients that are still missing count as zero. No action of the chunk may differ by more than `tolerance`.
     """
 
     tolerance: float
@@ -61,7 +65,7 @@ class MotionRule(DistanceRule):
 
     @functools.cached_property
     def basis(self) -> np.ndarray:
-        """(H · D, H · D) float64: the motion, flattened, that each coefficient of 1 stands for."""
+        """(H · D, H · D) float64. Row i is the flattened motion whose coefficient i is 1, and all others are 0."""
         import numpy as np
         from scipy.fft import idct
 
@@ -72,11 +76,14 @@ class MotionRule(DistanceRule):
         return motions
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """Return a single zero: tokens have no distance."""
+        """Return (0,), because FAST tokens have no distance to each other. The radius `r` is not used."""
         return (0,)
 
     def difference(self, before: Sequence[int], token: int, other: int) -> float:
-        """Return the largest difference of a normalised action between the motions of two tokens after `before`."""
+        """Return the largest difference between the normalised actions of two motions.
+
+        One is decoded from the tokens `before` and `token`, the other from the tokens `before` and `other`.
+        """
         import numpy as np
 
         code = self.space.code
@@ -89,7 +96,7 @@ class MotionRule(DistanceRule):
         return float(np.abs(gap @ self.basis[start:]).max(initial=0.0))
 
     def judge_after(self, tokens: Sequence[int], tree: TokenTree, target_tokens: Sequence[int], r: int) -> Accepted:
-        """Return the longest path of close motions. Of equally long paths the first wins; `r` is not used."""
+        """Return the longest path of accepted draft tokens. Of equally long paths the first wins. `r` is not used."""
         paths: dict[int, list[int]] = {ROOT: list(tokens)}  # tokens of the chunk up to each accepted node
         best = ROOT
         for node, (token, parent) in enumerate(zip(tree.tokens, tree.parents, strict=True)):
@@ -104,7 +111,7 @@ class MotionRule(DistanceRule):
 
 @dataclass
 class CoarseBoundarySettings:
-    """Decode at most so many tokens of a chunk: a coarse motion, since a code begins with the low frequencies."""
+    """Decode only the first `tokens` tokens of a chunk. They give a coarse motion: FAST codes low frequencies first."""
 
     kind: str = "coarse"
     tokens: int = number(4, 1, MOST_TOKENS)  # largest number of tokens
@@ -112,7 +119,7 @@ class CoarseBoundarySettings:
 
 @BoundaryPart("coarse", CoarseBoundarySettings, any_code=True)
 class Coarse(Boundary):
-    """Ends every chunk after at most `tokens` tokens. The missing coefficients, of the higher frequencies, are zero."""
+    """Ends every chunk after at most `tokens` tokens. The missing coefficients (high frequencies) are zero."""
 
     @classmethod
     def build(cls, settings: Any, context: Context) -> Coarse:
@@ -121,5 +128,5 @@ class Coarse(Boundary):
         return cls(settings, context)
 
     def choose(self, path: np.ndarray) -> Choice:
-        """Return the limit. The path is not used."""
+        """Return a choice that limits the number of tokens. The hand's path is not used."""
         return Choice("drafter", most=self.settings.tokens)

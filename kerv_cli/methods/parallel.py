@@ -50,7 +50,7 @@ def is_parallel(target: object) -> bool:
 def check_parallel(parts: Mapping[str, Part], parallel: bool) -> None:
     """Refuse skip=parallel for a target that decodes token by token, and every other method for a parallel target.
 
-    A method with skip=parallel is also refused if it drafts.
+    A method that has skip=parallel and also drafts is refused, too.
 
     Args:
         parts: All parts of the method, by kind.
@@ -73,7 +73,7 @@ def check_parallel(parts: Mapping[str, Part], parallel: bool) -> None:
 
 
 def native_decoder(target: Any) -> Decoder:
-    """Return a decoder without drafts: one token after another, or all in one forward for a parallel target."""
+    """Return a decoder without drafts. A parallel target decodes all tokens in one forward, others token by token."""
     from kerv_cli.engine.decoder import Decoder, Parts
 
     return Decoder(target, Parts(skip=ParallelPass(target)) if is_parallel(target) else None)

@@ -71,7 +71,7 @@ class SpeedSkip(Skip):
         self.executed, self.by_target = 0, True
 
     def take(self, chunk: Chunk) -> SkipDecision:
-        """Take the prediction, if the hand is fast and the target decoded enough of the last actions."""
+        """Return the predicted chunk if the hand is fast and the target decoded enough actions, else no chunk."""
         executed = len(chunk.situation.path) - 1
         self.decoded.extend([self.by_target] * (executed - self.executed))
         self.executed = executed

@@ -24,8 +24,8 @@ decoded the chunk, because no further decode without verification was allowed, o
 class StreakSkipSettings:
     """Execute 1, then 2, 4, … drafts without verification, as long as each verified chunk agrees with its draft (§4.5).
 
-    The executed draft is the prefill draft. If that merges the drafts of several proposers, only the first proposer's
-    draft is executed and compared.
+    The executed draft is the prefill draft. If the prefill draft merges the drafts of several proposers, only the draft
+    of the first proposer is executed and compared.
     """
 
     kind: str = "streak"

@@ -34,7 +34,7 @@ class CertifiedSkipSettings:
 
 @dataclass
 class ScopedSettings:
-    """On the certificate's tasks, draft with the certified proposer. On other tasks, draft with `outside`."""
+    """On the certificate's tasks, draft with the certified proposer. On other tasks, use the proposer `outside`."""
 
     kind: str = "scoped"
     outside: str = "merged"  # prefill draft on other tasks

@@ -32,8 +32,8 @@ class Candidate:
         won: Number of pairs that only the candidate solved.
         p: p-value of the hypothesis that the candidate loses the margin or more. None: not tested, because an earlier
             candidate failed.
-        draft: Settings of the proposer whose drafts the rule executes. Old certificates do not store them. Their drafts
-            were those of the scout, a drafter that reads the image itself.
+        draft: Settings of the proposer whose drafts the rule executes. Old certificates do not store these settings.
+            All their drafts came from the scout, a drafter that reads the image itself.
     """
 
     label: str
@@ -48,7 +48,7 @@ class Candidate:
 
     @property
     def rule(self) -> Any:
-        """Settings of the skip rule, as the dataclass of this rule."""
+        """Settings of the skip rule, as an instance of the rule's dataclass."""
         return _part_settings("skip", self.skip)
 
     @property
@@ -71,7 +71,7 @@ class Attempt:
         order: Labels of the candidates in the order of the tests.
         seeds: Seeds of the episodes, as text such as `1000-1049;1100`.
         margin: Percentage points of success that may be lost.
-        delta: Level of the test: an upper bound of the probability that it certifies falsely.
+        delta: Level of the test: an upper bound of the probability that the test certifies falsely.
         pairs: Number of pairs of episodes.
         certified: Label of the last candidate in `order` that was certified. Empty if none was.
     """
@@ -110,13 +110,13 @@ class Certificate:
         world: Camera and horizon (maximum episode length).
         dtype: Number format of the models.
         margin: Percentage points of success that may be lost.
-        delta: Level of this test: an upper bound of the probability that it certifies falsely.
+        delta: Level of this test: an upper bound of the probability that the test certifies falsely.
         seeds: Seeds of the test episodes, as text such as `1000-1049;1100`.
         candidates: All candidates in the order of the tests, from cautious to bold.
         chosen: Index of the last, and so the boldest, certified candidate. None: no candidate was certified.
-        provenance: How it was made.
+        provenance: How the certificate was made.
         made: Time of the test, ISO 8601. Empty in certificates of older versions.
-        earlier: All earlier tests of the same policy, the first one first.
+        earlier: All earlier tests of the same policy, oldest first.
     """
 
     target: str
@@ -224,7 +224,7 @@ class Certificate:
 
 
 class CertificateArtifact(Artifact[Certificate]):
-    """The kind of artifact `certificate`: a folder with a single JSON."""
+    """The kind of artifact `certificate`: a folder with a single JSON file."""
 
     kind, noun, made = "certificate", "certificate", "issued"
     command = ("calibrate", "success")
@@ -239,9 +239,11 @@ class CertificateArtifact(Artifact[Certificate]):
         return description.drafts
 
     def check_use(self, description: Certificate, use: Use) -> None:
-        """Refuse an environment, camera or horizon that was not certified. On certified tasks, refuse other methods.
+        """Refuse an environment, camera or horizon that was not certified.
 
-        A stressed world is allowed, although the certificate says nothing about stress.
+        If any task is one of the certificate's tasks, also refuse a method that decodes differently from the certified
+        method (see `Certificate.check_method`). On other tasks, and if no candidate was certified, every method is
+        allowed. A stressed world is allowed, although the certificate says nothing about stress.
 
         Raises:
             UsageError: The use differs from the certified one. The message names both values.
@@ -258,7 +260,7 @@ class CertificateArtifact(Artifact[Certificate]):
             description.check_method(use.method, use.dtype)
 
     def needs(self, description: Certificate) -> tuple[str, ...]:
-        """Return the kinds of artifacts that the certified draft needs."""
+        """Return the kinds of artifacts that the certified draft needs. Empty if no candidate was certified."""
         if description.certified is None:
             return ()
         source = description.certified.source

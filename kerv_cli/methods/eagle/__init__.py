@@ -37,7 +37,7 @@ class DrafterProposerSettings:
 
 
 def only_of_trees(settings: DrafterProposerSettings, *names: str) -> dict[str, str]:
-    """Return the settings `names`, each with the reason why a chain does not read it. Empty if the shape is a tree."""
+    """Return for each setting in `names` the reason why a chain ignores the setting. Empty if the shape is a tree."""
     return dict.fromkeys(names, "a chain is a single path") if settings.shape == "chain" else {}
 
 

@@ -84,15 +84,15 @@ class EagleNetwork(LayerStack):
             following: (B, T, E) embedding of the token after each position.
             hidden: (B, T, E) hidden state at each position.
             positions: (T,) rotary positions.
-            cache: Keys and values of earlier positions. None: there are none.
-            seen: (T, M) bool, which of the last M keys each query sees. None: causal.
+            cache: Keys and values of earlier positions. None: there are no earlier positions.
+            seen: (T, M) bool, which of the last M keys each query sees. None: all keys up to its own position.
         """
         return self.run((following, hidden), positions, cache, seen)
 
     def joined(self, target: Any, tree: bool) -> Any:
         """Return a compiled program that drafts level after level, with the target's embeddings and head.
 
-        None if this drafter or the target is not compiled.
+        Return None if this drafter or the target is not compiled.
 
         Args:
             target: The target.
@@ -364,7 +364,7 @@ class EagleDrafter(TrainableDrafter):
         """Decode held-out observations. Return the acceptance lengths with strict and relaxed (r = 9) acceptance.
 
         The acceptance length is the number of tokens committed per verification. The score is the sum of both lengths.
-        The network drafts in the target's number format, as it will when it is loaded.
+        The network drafts in the target's number format, as it will after it has been saved and loaded.
         """
         chosen = torch.linspace(0, len(held_out) - 1, min(VALIDATED, len(held_out))).long().tolist()
         prompts = [held_out.prompt[i, : held_out.lengths[i]][None].to(target.device, target.dtype) for i in chosen]
@@ -382,7 +382,7 @@ def compared(
         target: The target.
         predicted: (B, N − 1, E) states that the drafter predicts.
         hidden: (B, N − 1, E) the target's states.
-        counted: (B, N − 1) bool, which of them count: those before the end token. None: all.
+        counted: (B, N − 1) bool, which positions are compared (those before the end token). None: all positions.
 
     Returns:
         The smooth L1 loss of the states, and the cross-entropy of the drafter's token distribution with the target's.

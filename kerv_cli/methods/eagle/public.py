@@ -36,7 +36,7 @@ class Convention:
         positions: Rotary positions of drafted tokens. `sequence`: they count all tokens before. `text`: they do not
             count the vision tokens, because the published code counts token ids and vision tokens have none.
         mask: `causal`: every token sees all tokens before it. `prompt`: every token sees only the prompt without its
-            last token. Spec-VLA was trained like that.
+            last token. Spec-VLA's drafter was trained with this mask.
     """
 
     positions: str = "sequence"
@@ -48,9 +48,9 @@ class PublicShape:
     """Shape of a published drafter.
 
     Attributes:
-        language: Sizes of its Llama layer.
+        language: Sizes of the drafter's Llama layer.
         bias: Whether `fc` has a bias.
-        convention: How it differs from our own drafter.
+        convention: How the drafter differs from our own.
         skipped: Number of vision tokens in the target's prompt. They get no position number with `positions=text`.
     """
 
@@ -81,7 +81,7 @@ class PublicDrafter(nn.Module):
         Args:
             batch: Number of sequences.
             capacity: Maximum number of tokens.
-            fixed: Whether its tensors always have full size, as CUDA graphs need. None: only on CUDA.
+            fixed: Whether the cache's tensors always have full size, as CUDA graphs need. None: only on CUDA.
         """
         weight, sizes = self.fc.weight, self.shape.language.cache_sizes(batch, capacity)
         return DraftCache(*sizes, weight, weight.is_cuda if fixed is None else fixed)
@@ -110,7 +110,7 @@ class PublicDrafter(nn.Module):
             positions: (T,) rotary positions.
             cache: Keys and values of earlier positions. If it is empty, `hidden` must have the states of the whole
                 prompt. None: there are no earlier positions.
-            seen: (T, M) bool, which of the last M keys each query sees. None: causal.
+            seen: (T, M) bool, which of the last M keys each query sees. None: all keys up to its own position.
         """
         if cache is not None and not cache.length:
             cache.prompt = hidden.shape[1]
@@ -126,7 +126,7 @@ class PublicDrafter(nn.Module):
         Args:
             x: (B, T, E) inputs of the layers.
             cache: Keys and values of S earlier tokens. None: there are none, and x is the prompt.
-            seen: (T, M) bool, which of the last M keys each query may see. None: causal.
+            seen: (T, M) bool, which of the last M keys each query may see. None: all keys up to its own position.
 
         Returns:
             (T, S + T): 0 for visible keys, −∞ for hidden keys.
@@ -147,15 +147,15 @@ def layout_of(shape: PublicShape) -> dict[str, Sizes]:
 
 
 def read_public(folder: Path, target: ReadableTarget, convention: Convention) -> tuple[PublicShape, dict[str, Tensor]]:
-    """Read a published drafter. Its copy of the target's embeddings is left out.
+    """Read a published drafter, without its copy of the target's embeddings.
 
     Args:
         folder: Folder with `config.json` and `model.safetensors`.
-        target: The target that it drafts for.
-        convention: How it differs from our own drafter.
+        target: The target for which the drafter drafts.
+        convention: How the drafter differs from our own.
 
     Returns:
-        Its shape, and its tensors by name.
+        The drafter's shape, and its tensors by name.
 
     Raises:
         CheckpointError: The folder is incomplete, damaged or pickled, or the drafter has another width than the target.
@@ -177,7 +177,7 @@ def read_public(folder: Path, target: ReadableTarget, convention: Convention) ->
 
 
 def load_public(folder: Path, shape: PublicShape, target: ReadableTarget) -> PublicDrafter:
-    """Load an imported drafter with frozen weights, on the target's device and in its number format.
+    """Load an imported drafter with frozen weights, on the target's device and in the target's number format.
 
     Raises:
         CheckpointError: The weights are damaged or have other shapes.

@@ -80,7 +80,7 @@ class EarlyNetwork(Compilable):
         self.head = nn.Linear(settings.rank, actions.tokens)
 
     def new_program(self) -> Program | None:
-        """Return the network as a compiled `Program`. None for a number format without kernels."""
+        """Return the compiled network. None if there are no compiled kernels for the weights' number format."""
         return Program(self.logits, (1, len(self.mean))) if self.mean.dtype in FORMATS else None
 
     def standardise(self, features: Tensor) -> None:
@@ -134,8 +134,8 @@ def choose(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tensor, Tensor]
     the bin with more probability close to it wins, because it is likely nearer to the target's token. For a strict
     token the most probable bin is chosen.
 
-    The estimate treats tokens as independent, and training on soft labels makes it too low. Use it only to compare
-    chunks.
+    The estimate treats tokens as independent, and training on soft labels makes the estimate too low. Use it only to
+    compare chunks.
 
     Args:
         logits: (B, N, V).
@@ -182,7 +182,10 @@ class EarlyProposer(ChainProposer):
         self._drafted: tuple[Chunk, list[int], float] | None = None  # the last chunk, its draft, and the estimate
 
     def compile(self) -> Program | None:
-        """Return a program that computes `row` from a radius (1, 1) and a prompt. None if a part is not compiled."""
+        """Return a compiled program that computes `row` from a radius (1, 1) and a prompt.
+
+        Return None if the drafter is not compiled, or if the target cannot be compiled together with it.
+        """
         early: Any = self.early
         target: Any = self.target
 
@@ -280,7 +283,7 @@ class EarlyDrafter(TrainableDrafter):
     def validate(self, network: Any, target: Any, held_out: Any, settings: Any) -> Metrics:
         """Return metrics that compare drafts of held-out observations with the target's tokens.
 
-        All plain episodes together weigh as much as all perturbed episodes (executed with noise) together.
+        All perturbed episodes (executed with noise) together weigh as much as all other episodes together.
         """
         chosen = torch.arange(len(held_out)).split(256)
         outputs = [self.outputs(network, target, held_out.where(indices)) for indices in chosen]

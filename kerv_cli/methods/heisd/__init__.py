@@ -52,7 +52,7 @@ def artifact() -> type:
 class Index(ABC):
     """A search for the stored entries whose keys are most similar to a given key.
 
-    It returns row numbers of the datastore. The datastore then ranks these rows exactly.
+    A search returns row numbers of the datastore. The datastore then ranks these rows exactly.
     """
 
     def __init__(self, store: Datastore, settings: Any) -> None:
@@ -73,7 +73,7 @@ class Index(ABC):
 
 @registry.SearchPart("exact")
 def exact(store: Datastore, settings: Any) -> Index:
-    """Search by comparing the key with all entries of the task: datastore=exact, the default."""
+    """Return the search that datastore=exact (the default) chooses. It compares a key with all entries of the task."""
     from kerv_cli.methods.heisd.datastore import ExactIndex
 
     return ExactIndex(store, settings)
@@ -130,7 +130,7 @@ class RetrievalProposer(ChainProposer):
         return self._nearest[1]
 
     def similarity(self, chunk: Chunk) -> float | None:
-        """Return the cosine of the most similar stored entry, if the datastore was searched for this chunk."""
+        """Return the cosine of the most similar stored entry. None if the datastore was not searched for this chunk."""
         searched = self._nearest is not None and self._nearest[0] is chunk
         return float(self.neighbours(chunk).similarity[0]) if searched else None
 
@@ -194,7 +194,7 @@ class HybridProposer(Proposer):
         self.chosen.begin(chunk)
 
     def similarity(self, chunk: Chunk) -> float | None:
-        """Return the similarity that the retrieval found."""
+        """Return the cosine of the most similar stored entry. None if the datastore was not searched for this chunk."""
         return self.proposers["retrieval"].similarity(chunk)
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
@@ -308,7 +308,7 @@ class RandomBoundarySettings:
 
 @registry.BoundaryPart("random", RandomBoundarySettings, chooses=True)
 class Random(Boundary):
-    """Chooses retrieval with probability p, else the drafter: a baseline that does not look at the path.
+    """Chooses retrieval with probability p, else the drafter: a baseline that ignores the path of the hand.
 
     With p = 1 retrieval drafts all chunks, with p = 0 the drafter drafts all. An episode's random numbers depend only
     on the boundary's seed, the task's full name and the episode's seed.
@@ -351,7 +351,8 @@ registry.BoundaryPart("always_drafter", chooses=True)(Always)
 class FusedBoundarySettings:
     """HeiSD: retrieval drafts if the hand moves straight and fast, the drafter if it moves in a curve or slowly.
 
-    F is the weighted sum of the path's radius of curvature and length. Retrieval drafts if F is at least F*.
+    F is the weighted sum of the radius of curvature and the length of the hand's path, both scaled to [0, 1]. Retrieval
+    drafts if F is at least the limit F*.
     """
 
     kind: str = "fused"
@@ -370,12 +371,12 @@ class FusedBoundarySettings:
 )
 @dataclass(frozen=True)
 class Fused(Boundary):
-    """Chooses retrieval if F ≥ F*. F is the weighted sum of the path's radius of curvature and length, both scaled.
+    """Chooses retrieval if F ≥ F*. F is the weighted sum of the radius of curvature and the length of the hand's path.
 
-    With fewer than three positions it chooses the drafter.
+    With fewer than three positions the drafter is chosen.
 
     Attributes:
-        ranges: Ranges that scale radius and length.
+        ranges: Ranges by which radius and length are scaled to [0, 1], before they are added.
         alpha: Weight of the radius. The length has the weight 1 − alpha.
         window: Number of newest positions to look at.
         f_star: The limit F*.
@@ -396,7 +397,7 @@ class Fused(Boundary):
         return cls(ranges, settings.alpha, settings.window, f_star)
 
     def choose(self, path: np.ndarray) -> Choice:
-        """Choose retrieval or the drafter from the newest `window` positions of the path (m, 3), in metres."""
+        """Choose retrieval or the drafter by the newest `window` positions of the hand's path (m, 3), in metres."""
         points = path[-self.window :]
         if len(points) < LEAST:
             return Choice("drafter")
@@ -480,11 +481,11 @@ class VerifySkip(Skip):
         self.s_min = min(self.high, max(self.low, s_min))
 
     def similarity(self, chunk: Chunk) -> float | None:
-        """Return the similarity that the retrieval found."""
+        """Return the cosine of the most similar stored entry. None if the datastore was not searched for this chunk."""
         return self.retrieval.similarity(chunk)
 
     def take(self, chunk: Chunk) -> SkipDecision:
-        """Take the most similar stored chunk, if it may be executed without verification."""
+        """Return the most similar stored chunk if it may be executed without verification, else no chunk."""
         if chunk.choice is not None and chunk.choice.mode != "retrieval":
             self.in_a_row = 0
             return SkipDecision()

@@ -1,4 +1,4 @@
-"""The shape of the hand's path, by which a boundary chooses (docs/methods.md §4.4): its curvature and its length."""
+"""Curvature and length of the hand's path, by which HeiSD's boundary chooses who drafts (docs/methods.md §4.4)."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ def radius_of_curvature(points: np.ndarray) -> float:
     """Fit a circle to a path, and return its radius in metres.
 
     The radius is infinite for fewer than three points, for a hand at rest and for a straight line. The points are
-    projected onto their best plane (by SVD). Taubin's algebraic method, which is exact on arcs, fits the circle. For
-    this, the points (x, y) are centred, and divided by `scale`, their root mean square distance from the centre. Let
-    z = x² + y². Let (a, b, c) be the right singular vector for the smallest singular value of the matrix with rows
-    [(z − 1) / 2, x, y]. Then the radius is scale / |a|.
+    projected onto the plane that fits them best (by SVD). Taubin's algebraic method, which is exact on arcs, fits the
+    circle. For this, the points (x, y) are centred, and divided by `scale`, their root mean square distance from the
+    centre. Let z = x² + y². Let (a, b, c) be the right singular vector for the smallest singular value of the matrix
+    with rows [(z − 1) / 2, x, y]. Then the radius is scale / |a|.
 
     Args:
         points: (n, 3) positions, metres.
@@ -57,9 +57,9 @@ class BoundaryRanges:
         radius_high: 95th percentile of R.
         length_low: Minimum of D.
         length_high: 95th percentile of D.
-        points: R and D of a hundred windows of the paths, both scaled to [0, 1]. All windows were sorted by R + D, and
-            evenly spaced ones were taken. They give the quantiles of F, the weighted sum of the scaled R and D. Empty
-            in calibrations before version 1.1.
+        points: Scaled R and scaled D, in [0, 1], of a hundred windows of the paths. These windows are evenly spaced in
+            the list of all windows sorted by R + D. They give the quantiles of F, the weighted sum of the scaled R and
+            D. Empty in calibrations before version 1.1.
 
     Raises:
         CheckpointError: A range is empty or not finite.
@@ -85,7 +85,8 @@ class BoundaryRanges:
         Args:
             paths: Measured hand positions of each episode, (T, 3) metres.
             window: Number of positions in a window.
-            known: An older calibration's ranges. They are kept, and only the attribute `points` is measured.
+            known: An older calibration's ranges. They are kept, and only the attribute `points` is measured. None:
+                measure everything.
 
         Raises:
             CheckpointError: No path is curved, or the hand never moves.
@@ -147,5 +148,5 @@ class BoundaryRanges:
         return alpha * radius + (1 - alpha) * length
 
     def of_path(self, points: np.ndarray, alpha: float) -> float:
-        """Return F of a path through points (n, 3), in metres. `alpha` is the weight of the radius."""
+        """Return F of a path through points (n, 3), in metres, with the weight `alpha` of the radius."""
         return self.fused(radius_of_curvature(points), path_length(points), alpha)

@@ -47,7 +47,7 @@ class Shard:
     """The entries of one task.
 
     Attributes:
-        rows: The task's first row, and the row after its last one.
+        rows: The task's first row, and the row after its last row.
         seeds: Seeds of the task's episodes.
     """
 
@@ -63,7 +63,7 @@ class Manifest:
         format: Version of the file format.
         kind: Always `datastore`.
         key: Segments of the prompt from which keys are made, such as `scene`.
-        width: How many numbers a key has.
+        width: Length d of a key.
         rows: Number of entries.
         chunk: Number H of control steps per chunk.
         actions: The target's action space.
@@ -71,7 +71,7 @@ class Manifest:
         demos: Hash of the demonstrations.
         files: Hash of each file beside the manifest, by name.
         tasks: Rows and seeds of each task, by the task's full name.
-        provenance: How it was made.
+        provenance: How the datastore was made.
     """
 
     format: Literal[2]
@@ -98,7 +98,7 @@ def prompt_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) 
 
     Args:
         prompt: (B, P, E) encoded prompts.
-        target: The target that encoded them.
+        target: The target that encoded the prompts.
         segments: Names of the S segments of the prompt to use, such as `scene`.
 
     Returns:
@@ -170,7 +170,10 @@ class ExactIndex(Index):
     """datastore=exact, the default: compare the key with all entries of the task, in this process."""
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return the k most similar rows, and all rows within rounding errors of the k-th; see `Index.candidates`."""
+        """Return the k most similar rows, and all other rows that could be among them but for rounding errors.
+
+        `Index.candidates` explains the arguments.
+        """
         shard = self.store.shards[task]
         scores = self.store.vectors[shard] @ key
         if without is not None:
@@ -214,7 +217,7 @@ class Datastore:
 
     @functools.cached_property
     def longest(self) -> float:
-        """Euclidean length of the longest key. This length bounds the rounding errors of the search."""
+        """Largest Euclidean norm of a stored key. It bounds the rounding errors of the search."""
         return float(np.linalg.norm(self.vectors, axis=1).max(initial=0.0))
 
     @classmethod
@@ -258,7 +261,7 @@ class Datastore:
 
         Args:
             prompt: (1, P, E) encoded prompt.
-            target: The target that encoded it.
+            target: The target that encoded the prompt.
         """
         (pooled,) = read(prompt_key(prompt, target, self.manifest.key)[0])
         key = pooled.astype(np.float32, copy=False)

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 class PredictorPart(ProposerPart):
     """A registered predictor of the next actions. It serves as a proposer, and as `rectifier.predictor`.
 
-    The registered function builds a `Predictor` (`prediction.py`), or an object with its attribute `name` and its
-    method `predict`.
+    The registered function builds a `Predictor` (`prediction.py`), or another object with the attribute `name` and the
+    method `predict` of a `Predictor`.
     """
 
     when: Literal["prefill", "states"] = PREFILL
@@ -86,7 +86,7 @@ def find_predictor(name: str) -> PredictorPart:
 
 @dataclass
 class CompensateSettings:
-    """KERV: after a rejection, predict the rest of that control step."""
+    """KERV: after a rejected draft token, predict the rest of the token's control step."""
 
     kind: str = "compensate"
     # kalman, damped, hold, linear (ours); walk (public code); draft: the rejected draft's remaining tokens (ours)
@@ -120,16 +120,16 @@ def needs_of_compensation(settings: CompensateSettings) -> tuple[str, ...]:
 
 @RectifierPart("compensate", CompensateSettings, needs=needs_of_compensation)
 class Compensation(Rectifier):
-    """KERV: after a rejection, keeps the accepted tokens and predicts the rest of that control step.
+    """KERV: after a rejected draft token, keeps the tokens before and predicts the rest of the control step.
 
-    These settings change it:
+    The settings change what is kept and predicted:
 
     - `use_target_token` (ours): also keep the target's token at the rejected position, which is already computed.
     - `drop` (ours): end the chunk after the predicted steps. Otherwise the target decodes the later steps.
     - `steps` (the paper's predict length PL): how many control steps to fill.
     - `hold_strict` (ours): strict DoFs, such as the gripper, keep their last value. Otherwise they are predicted, too.
-    - `predictor=draft` (ours): fill with the rejected draft's remaining tokens first. A draft was made from the
-      observation, a prediction only from past actions.
+    - `predictor=draft` (ours): fill with the remaining tokens of the rejected draft first. A draft was made from
+      the observation, a prediction only from past actions.
     - `rest`: number of decodes after each compensation in which nothing is compensated.
     """
 
@@ -260,7 +260,7 @@ class Kinematic(Threshold):
         """Read the settings. If they contain no K_S, read the task's K_S from the calibration.
 
         Raises:
-            UsageError: The largest radius is larger than the distance of any two tokens.
+            UsageError: The largest radius is larger than the largest distance between two tokens.
             CheckpointError: The calibration has no K_S for the task.
         """
         context.check_radius("r_max", settings.r_max)
@@ -307,7 +307,7 @@ class Kinematic(Threshold):
 
 @ThresholdPart("change", KinematicThresholdSettings, needs=needs_of_variability)
 class Change(Kinematic):
-    """KERV, read with a signed change: the acceptance radius r shrinks if the variability K grows, else it grows.
+    """KERV's rule with a signed change: the acceptance radius r shrinks if the variability K grows, else it grows.
 
     r ← clamp(r − (r_max − r_min) · sign(Δ) · (1 − exp(−|Δ / K_S|^φ)), r_min, r_max). Δ is the change of K between the
     last two decodes in which drafts were compared. An episode begins as if the last K were K_S.
@@ -321,7 +321,7 @@ class Change(Kinematic):
 
 @ThresholdPart("offset", KinematicThresholdSettings, needs=needs_of_variability)
 class Offset(Kinematic):
-    """KERV, read as its README says: r = r_min + (r_max − r_min) · exp(−(|ΔK| / K_S)^φ).
+    """KERV's rule as its README says: r = r_min + (r_max − r_min) · exp(−(|ΔK| / K_S)^φ).
 
     ΔK is the change of the variability K between the last two decodes in which drafts were compared. So r is large
     while K is steady, and small when K changes. The first change of K in an episode is measured from K_S.
@@ -361,7 +361,7 @@ class Schedule(Threshold):
         """Read the settings.
 
         Raises:
-            UsageError: The largest radius is larger than the distance of any two tokens.
+            UsageError: The largest radius is larger than the largest distance between two tokens.
         """
         context.check_radius("r_max", settings.r_max)
         self.settings, self.decodes = settings, 0

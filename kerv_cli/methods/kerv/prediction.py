@@ -102,8 +102,8 @@ class Predictor:
 
     Attributes:
         name: Name of the predictor in settings.
-        least: Minimum number of past actions that the formula can use.
-        minimum: With fewer past actions nothing is predicted.
+        least: Minimum number of past actions that the formula needs.
+        minimum: Minimum number of past actions for a prediction. With fewer, nothing is predicted.
     """
 
     name = ""
@@ -121,8 +121,8 @@ class Predictor:
 
         Args:
             held: (D,) bool. True: the DoF keeps its last value.
-            noise: Fitted noise of a Kalman filter. None for other predictors.
-            minimum: With fewer past actions there is no prediction.
+            noise: Fitted noise of a Kalman filter. None: the predictor needs no fitted noise.
+            minimum: Smallest number of past actions from which actions are predicted.
             window: Maximum number of past actions that are used.
             horizon: Maximum number of control steps ahead.
         """
@@ -142,10 +142,10 @@ class Predictor:
         return weights
 
     def released(self) -> Self:
-        """Return the predictor that also predicts the strict DoFs, instead of holding them.
+        """Return a copy of this predictor that also predicts the strict DoFs, instead of holding them.
 
         Raises:
-            CheckpointError: It is a Kalman filter, and the calibration has no noise for a strict DoF.
+            CheckpointError: The predictor is a Kalman filter, and the calibration has no noise for a strict DoF.
         """
         if self.noise is not None and not all(self.noise.q):
             raise CheckpointError(
@@ -203,7 +203,10 @@ class Linear(Predictor):
     least = 2
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return the weights (horizon, window): h steps ahead, 1 + h on the newest action and −h on the one before."""
+        """Return the weights (horizon, window).
+
+        For h steps ahead, the newest action has the weight 1 + h, and the action before it has the weight −h.
+        """
         ahead = np.arange(1, self.horizon + 1)
         weights = np.zeros((self.horizon, window))
         weights[:, -1], weights[:, -2] = 1 + ahead, -ahead
@@ -233,7 +236,7 @@ class Walk(Predictor):
 
     It is a Kalman filter whose state is the action alone. Its gain is 0.999, so it nearly repeats the last action. The
     first action is its first state, with the variance R. A token id is a normalised value times a scale plus an offset.
-    So the filter has the same weights for both.
+    So the filter has the same weights for token ids and for normalised values.
     """
 
     name = "walk"
@@ -265,7 +268,7 @@ class Ridge(Predictor):
     def weights(self, dof: int, window: int) -> np.ndarray:
         """Return the weights (horizon, window): X' (XᵀX + λI)⁻¹ Xᵀ, where λ is the penalty.
 
-        X has the row (t, 1) for each past control step t = 0, 1, …, and X' for each future step.
+        X has one row (t, 1) for each past control step t = 0, 1, …. X' has one such row for each future control step.
         """
         times = np.arange(window + self.horizon)
         rows = np.stack([times, np.ones(len(times))], 1)
@@ -279,7 +282,7 @@ PREDICTORS = {kind.name: kind for kind in (Hold, Linear, Kalman, Damped, Walk)}
 
 
 def predictor_of(name: str, context: Context) -> Predictor:
-    """Return the predictor with this name. It can predict all control steps of a chunk.
+    """Return the predictor with this name. Its horizon is long enough for all control steps of a chunk.
 
     The noise of a Kalman filter comes from the calibration.
     """
@@ -320,9 +323,9 @@ def assemble(
 ) -> np.ndarray | None:
     """Assemble the actions of a compensated chunk: known tokens, then drafted tokens, then predictions.
 
-    `settings.steps` control steps are filled, beginning with the step in which the known tokens end. One step fewer is
-    filled if that step has fewer than `min_verified` known DoFs, or none while `drop` is set. This does not apply if it
-    is the chunk's first step.
+    `settings.steps` control steps are filled. The first of them is the step in which the known tokens end. This step is
+    left out, and one step fewer is filled, if it has fewer than `min_verified` known DoFs. The same happens if it has
+    no known DoF and `drop` is set. The first step of the chunk is never left out.
 
     Args:
         tokens: Known tokens of the chunk: accepted draft tokens and tokens of the target.

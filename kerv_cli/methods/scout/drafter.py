@@ -5,7 +5,7 @@ computes. So chunks without verification never pay for the target's encoder, and
 the target's encoder. Its own vision encoder (stem) and its estimate of the positions of object and goal feed the
 network of the early drafter.
 
-Shapes: B observations, p numbers of proprioception, F features, K places, N tokens of a chunk, V bins.
+Shapes: B observations, p numbers of proprioception, F features, K estimated positions, N tokens of a chunk, V bins.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from kerv_cli.worlds.demos.files import DemoEpisode
 class ScoutNetwork(Compilable):
     """The network from an observation to the logits of a chunk (N tokens, V bins).
 
-    It also estimates the positions of K places, such as object and goal.
+    It also estimates K positions: those of the task's places, such as object and goal.
     """
 
     centre: Tensor
@@ -81,7 +81,7 @@ class ScoutNetwork(Compilable):
         self.drafter = EarlyNetwork(s, actions, chunk, of_views + s.word_width + scene_width(observation))
 
     def forward(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
-        """Return the logits (B, N, V), and the estimated positions of the places (B, K, 3), in metres."""
+        """Return the logits (B, N, V), and the estimated positions of object and goal (B, K, 3), in metres."""
         given = self.views(inputs)
         if self.compiled is not None and not any(map(wants_gradient, given)):
             logits, places = self.compiled(*given)
@@ -102,7 +102,7 @@ class ScoutNetwork(Compilable):
         return found
 
     def see(self, proprioception: Tensor, words: Tensor, *views: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the drafter's input features and the estimated positions of the places.
+        """Compute the drafter's input features, and estimate the positions of the task's places (object, goal).
 
         Args:
             proprioception: (B, p) proprioception.
@@ -121,17 +121,20 @@ class ScoutNetwork(Compilable):
         return torch.cat([*cells, words, scene], -1), places
 
     def network(self, *given: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the result of `forward` with the PyTorch modules. The arguments are the results of `views`."""
+        """Compute the result of `forward` from the results of `views`, with the PyTorch modules."""
         features, places = self.see(*given)
         return self.drafter.logits(features.to(self.drafter.head.weight.dtype)), places
 
     def new_program(self) -> Program | None:
-        """Return the network without its vision encoders as a compiled `Program`. None for a format without kernels."""
+        """Return the compiled network, without its vision encoders.
+
+        Return None if there are no compiled kernels for the weights' number format.
+        """
         return Program(self.network, *self.shapes) if self.cells.weight.dtype in FORMATS else None
 
     @property
     def shapes(self) -> list[tuple[int, ...]]:
-        """Shapes of the results of `views` for one observation."""
+        """Shapes of the tensors that `views` returns for one observation."""
         s = self.settings
         of_view = (1, s.grid**2, s.cell_width), (1, 2 * s.keypoints)
         return [(1, len(self.observation.proprioception)), (1, s.word_width), *of_view * len(self.stems)]
@@ -147,7 +150,10 @@ class ScoutProposer(EarlyProposer):
         super().__init__(scout.drafter, target)
 
     def compile(self) -> Program | None:
-        """Return a program that computes `row` from a radius (1, 1) and views. None if the scout is not compiled."""
+        """Return a compiled program that computes `row` from a radius (1, 1) and the results of `ScoutNetwork.views`.
+
+        Return None if the scout is not compiled.
+        """
         scout = self.scout
 
         def row(radius: Tensor, *views: Tensor) -> Tensor:
@@ -184,7 +190,7 @@ class ScoutExamples(Observations, Decodes):
 class ScoutDrafter(EarlyDrafter):
     """The kind of artifact `scout`: a drafter with its own vision encoder, for targets with cameras.
 
-    In the first `train.scene_steps` steps of its training it learns only to estimate positions.
+    In the first `train.scene_steps` steps of the training, the scout learns only to estimate positions.
     """
 
     kind = noun = "scout"
@@ -228,7 +234,7 @@ class ScoutDrafter(EarlyDrafter):
         """Do nothing. The features cannot be standardised, because they change while the vision encoder is trained."""
 
     def outputs(self, network: Any, target: Any, batch: Any) -> tuple[Tensor, ...]:
-        """Run the network on a batch of B examples. Return logits (B, N, V) and positions (B, K, 3)."""
+        """Run the network on a batch of B examples. Return logits (B, N, V) and estimated positions (B, K, 3)."""
         return network(batch.inputs(target.device))
 
     def loss(self, network: Any, target: Any, batch: Any, step: int, settings: Any) -> tuple[Tensor, Metrics]:
