@@ -1,6 +1,6 @@
-"""`kerv calibrate`: measure on demonstrations what KERV and HeiSD need, and write one JSON (docs/methods.md §3, §4).
+"""`kerv calibrate`: measure numbers that KERV and HeiSD need, and write a JSON file (docs/methods.md §3, §4).
 
-The JSON holds:
+The numbers are measured on demonstrations. The JSON file holds:
 
 - the noise of the kinematic predictors,
 - each task's K_S, the reference level of the kinematic variability K (how far drafts are from the target's tokens),
@@ -87,7 +87,7 @@ def calibrate(
         begin: Called once all settings are checked.
 
     Returns:
-        The JSON that was written, the calibration, and one line per section that was not measured, with the reason.
+        The path of the JSON file, the calibration, and one line per section that was not measured, with the reason.
 
     Raises:
         UsageError: A number is out of range, or a task is unknown.
@@ -181,8 +181,8 @@ def presample(
         progress: Called with two numbers: finished tasks, all tasks.
 
     Returns:
-        For each task its reference level K_S: the median over its decodes of K, the distance between the draft and the
-        target's tokens.
+        The reference level K_S of each task. K is the distance between a draft and the target's tokens. K_S is the
+        median of K over the task's decodes.
 
     Raises:
         KervError: No decode of a task compared a draft with the target.
@@ -204,8 +204,8 @@ def presample(
 def reference_level(records: Sequence[DecodeRecord], actions: ActionSpace, chunk: int) -> Variability:
     """Return a task's reference level K_S: the median of the variability K over the decodes, for each measure of K.
 
-    Decoding divides by K_S, so it must not be 0. It is at least the smallest possible K above 0: that of a chunk in
-    which a single token is off by one bin.
+    Decoding divides by K_S, so it must not be 0. It is at least the smallest possible K above 0, which is the K of a
+    chunk in which a single token is off by one bin.
 
     Args:
         records: Decodes of the task.
@@ -255,9 +255,10 @@ def fit_boundary(
     """Return the ranges of curvature and path length, for each window length.
 
     Args:
-        paths: End effector in each episode, (T, 3) metres.
+        paths: Positions of the end effector in each episode, (T, 3) metres.
         windows: Window lengths, in positions.
-        old: An earlier calibration. Its ranges are kept for the window lengths that it has. None: there is none.
+        old: An earlier calibration. Its ranges are kept, for the window lengths that it has. None: there is no earlier
+            calibration.
         progress: Called with two numbers: finished window lengths, all window lengths.
 
     Raises:
@@ -272,9 +273,9 @@ def fit_boundary(
 
 
 def completed(old: Calibration, new: Calibration) -> Calibration:
-    """Return the old calibration, and fill in the numbers that it lacks from the new one.
+    """Return the old calibration, completed with the numbers of the new one that the old one lacks.
 
-    The boundary ranges are those of `new`, because `fit_boundary` has already kept the old ones in them.
+    The boundary ranges are those of `new`, because `fit_boundary` has already copied the old ranges into `new`.
     """
     noise = {}
     for kind in FILTERS:
@@ -306,7 +307,7 @@ class Windows:
 
 
 def episode_windows(episode: DemoEpisode, actions: ActionSpace, window: int, horizon: int) -> np.ndarray:
-    """Cut an episode into windows: one for each control step with `window` control steps before it.
+    """Cut an episode into windows, one around each control step (moment) that has `window` control steps before it.
 
     Args:
         episode: A demonstration.
@@ -410,7 +411,7 @@ def fit_filters(windows: Windows) -> dict[str, Noise]:
     """Fit the Kalman filters `kalman` and `damped`.
 
     Args:
-        windows: Actions before each moment, and after it, which the filters should predict.
+        windows: The actions before each moment, and the actions after it, which the filters should predict.
 
     Returns:
         For each filter's name, the noise and damping per DoF, strict DoFs included.
@@ -471,7 +472,7 @@ def lowest_level(matches: Matches, confidence: float, least: int = LEAST) -> flo
         least: Minimum number of matches with similarity ≥ s.
 
     Returns:
-        The similarity s; None if there is none.
+        The similarity s. None if there are not enough good matches for any s.
     """
     order = np.argsort(-matches.similarity, kind="stable")
     ranked = matches.similarity[order]
@@ -487,12 +488,12 @@ def task_levels(matches: Matches, confidence: float) -> SkipLevel:
     In a rollout, feedback after each episode may move s_min between the bounds `low` and `high`. Each of the three is
     the smallest similarity that keeps the share of wrong chunks within a limit. With a confidence of 0.9 the limits are
     0.1 for s_min, 0.2 (twice as much) for `low`, and 0.033 (a third) for `high`. If no similarity keeps the limit of
-    `high`, `high` is the largest similarity seen. If none keeps the limit of s_min, all three are NEVER, and the task
-    never skips.
+    `high`, `high` is the largest similarity seen. If no similarity keeps the limit of s_min, all three are NEVER, and
+    the task never skips.
 
     Args:
         matches: The task's matches.
-        confidence: Minimum share of good chunks among the skipped ones.
+        confidence: Minimum share of good chunks among the chunks that are executed without verification.
     """
     similarity, wrong = matches.similarity, 1 - confidence
     s_min = lowest_level(matches, confidence)
@@ -520,7 +521,7 @@ def skip_section(
         store: The datastore.
         tasks: Full names of the tasks.
         epsilon: Largest mean absolute error of a good chunk, in normalised action units.
-        confidence: Minimum share of good chunks among the skipped ones.
+        confidence: Minimum share of good chunks among the chunks that are executed without verification.
         progress: Called with two numbers: finished tasks, all tasks.
 
     Returns:

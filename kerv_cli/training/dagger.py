@@ -31,7 +31,7 @@ from kerv_cli.worlds.spec import EnvironmentSpec, World
 class PolicyActor:
     """Chooses the actions that a recording executes: for each chunk, either the policy's or the expert's.
 
-    Task and seed determine which chunks are the expert's. The decoder is never told whether an episode succeeded, so
+    Task and seed determine in which chunks the expert acts. The decoder is never told whether an episode succeeded, so
     no episode depends on earlier episodes.
 
     Args:
@@ -56,7 +56,7 @@ class PolicyActor:
         """Return the action (D,) to execute now.
 
         Args:
-            label: (D,) the expert's action in this state. It is returned if the expert executes this chunk.
+            label: (D,) the expert's action in this state. This action is returned if the expert acts in this chunk.
         """
         if self.executed is not None:
             self.decoder.observe(self.executed, self.world.end_effector)
@@ -78,7 +78,7 @@ class PolicyActor:
 class PolicyActs:
     """A function that makes the `PolicyActor` of a recording. The process that records calls it.
 
-    It holds the settings and a hash, but no weights.
+    This object holds the settings of the recording and a hash, but no weights.
 
     Attributes:
         settings: Settings of the recording.
@@ -90,7 +90,7 @@ class PolicyActs:
 
     @classmethod
     def of(cls, settings: DemosSettings, spec: EnvironmentSpec) -> PolicyActs:
-        """Check that a recording's policy can act in an environment. Return the function that makes its `PolicyActor`.
+        """Check that the policy can act in an environment. Return the `PolicyActs` of the recording.
 
         The recording may contain more camera views than the target sees, to train another target on them.
 

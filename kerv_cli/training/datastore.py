@@ -128,7 +128,7 @@ def build_datastore(
 def first_episodes(
     dataset: DemoDataset, tasks: Sequence[str], limit: int
 ) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
-    """Return for each task the indices of the episodes with the lowest seeds, and their seeds.
+    """Return two dicts by task: the indices of the episodes with the lowest seeds, and these seeds.
 
     Args:
         dataset: The demonstrations.
@@ -174,7 +174,7 @@ def entries_of(target: Any, episode: DemoEpisode, space: ObservationSpace, key: 
 def contents_of(
     columns: dict[str, np.ndarray], shards: Mapping[str, Shard], components: int, half: bool
 ) -> dict[str, Any]:
-    """Return the contents of a datastore's files: by file name, an array or a table.
+    """Return the content of each file of a datastore, an array or a table, by file name.
 
     Args:
         columns: The values of each column, one row per entry of all tasks.
@@ -200,7 +200,7 @@ def contents_of(
 
 
 def write_files(folder: Path, files: Mapping[str, Any]) -> None:
-    """Write arrays and tables into a folder."""
+    """Write arrays and tables, given by file name, into a folder."""
     for name, content in files.items():
         # write to memory first: on a full disk, numpy and pyarrow raise errors without an errno
         buffer = io.BytesIO()

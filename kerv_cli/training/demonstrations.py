@@ -89,8 +89,8 @@ def demos_for(settings: S, target: TargetDescription, database: Database) -> tup
         database: The database of the results folder.
 
     Returns:
-        settings: The settings with `demos` filled in. `task` is filled in if it is empty and the demonstrations have
-            tasks that the target was not trained on. It then names the recorded tasks that the target was trained on.
+        settings: The settings with `demos` filled in. If `task` is empty and the demonstrations have tasks that
+            the target was not trained on, `task` becomes the recorded tasks that the target was trained on.
         dataset: The demonstrations.
 
     Raises:

@@ -1,4 +1,4 @@
-"""`kerv train drafter`: train a drafter to imitate how the target decodes. `kerv build drafter`: import one."""
+"""`kerv train drafter`: train a drafter to imitate the target. `kerv build drafter`: import a published drafter."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from kerv_cli.worlds import resolve_tasks
 
 
 def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Begin = quietly) -> tuple[Path, Metrics]:
-    """Train a drafter, from the resume file in its folder if there is one.
+    """Train a drafter. If its folder holds a resume file, continue that training.
 
     The target decodes in the number format `runtime.dtype`. The drafter's own weights are trained in float32.
 

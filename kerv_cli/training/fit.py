@@ -67,7 +67,7 @@ def fit(
     identity: str,
     progress: Progress = lambda done, total, text: None,
 ) -> Metrics:
-    """Train a network to `settings.steps`, from the folder's resume file if there is one.
+    """Train a network for `settings.steps` steps in all. If the folder holds a resume file, continue from there.
 
     Args:
         network: The network, on its device.
@@ -83,7 +83,7 @@ def fit(
         The metrics of the best weights.
 
     Raises:
-        CheckpointError: The resume file is damaged. Or it has reached `settings.steps` without a validation.
+        CheckpointError: The resume file is damaged. Or its training reached `settings.steps` without a validation.
         KervError: The training diverged.
         StorageError: The disk cannot be written.
         Interrupted: The process got Ctrl-C or SIGTERM. The current step was finished and the state is saved.
@@ -203,7 +203,9 @@ class State:
             write_if_changed(self.folder / "log.csv", table.encode())
 
     def restore(self) -> None:
-        """Load weights, optimiser and progress from the folder's resume file, if there is one, and say so.
+        """Load weights, optimiser and progress from the folder's resume file, if there is one.
+
+        If steps are left, a line on stderr names the step at which the training resumes.
 
         Raises:
             CheckpointError: The resume file is damaged.
@@ -240,15 +242,15 @@ def check_finite(metrics: Metrics, step: int) -> None:
 
 
 def batches(count: int, settings: TrainSettings, weights: Tensor | None = None) -> Callable[[int], Tensor]:
-    """Return a function that draws the samples of a step's batch, which depend only on `settings.seed` and the step.
+    """Return a function that draws the samples of a step's batch. They depend only on `settings.seed` and the step.
 
     Args:
         count: Number of samples.
         settings: Optimisation settings.
-        weights: (count,) float64. Sample i is as likely to be drawn as `weights[i]`. None: all are equally likely.
+        weights: (count,) float64. Sample i is drawn in proportion to `weights[i]`. None: all are equally likely.
 
     Returns:
-        Takes the step. Returns indices (B,) int64 of the samples.
+        The function. It takes the step, and returns the indices (B,) int64 of the samples.
     """
     cumulative = None if weights is None else weights.cumsum(0)
 

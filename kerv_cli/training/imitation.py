@@ -71,8 +71,8 @@ def load_samples(
         words: Tokenizer of the instructions.
         task_names: Full names of the tasks.
         progress: Called with two numbers: episodes read, all episodes.
-        waypoints: Number of later positions of the hand that the policy learns to estimate. 0: it learns the positions
-            of object and goal instead.
+        waypoints: Number of later positions of the hand that the policy learns to estimate. 0: the policy learns the
+            positions of object and goal instead.
 
     Raises:
         CheckpointError: An episode has too few actions of the expert, or images of another size.
@@ -109,7 +109,7 @@ def waypoints_of(episode: DemoEpisode, steps: np.ndarray, count: int, actions: A
         episode: A demonstration.
         steps: (n,) control steps.
         count: Number K of positions per step: those at the next K − 1 gripper changes and at the end. If fewer changes
-            follow, the end takes their place.
+            follow, the position at the end fills the rest.
         actions: The action space.
 
     Returns:
@@ -195,7 +195,7 @@ class Imitation:
     def tokens(self, batch: Samples) -> Tensor:
         """Return the action tokens (B, n) int64 of B samples, on the target's device.
 
-        n is N, or less if an end token ends all chunks before.
+        n is N, or less if all chunks end earlier, by an end token.
         """
         tokens = self.module.actions.chunk_tokens(batch.chunks.numpy())
         lengths = (tokens != self.module.actions.end).sum(1) + 1
@@ -205,7 +205,7 @@ class Imitation:
     def precision(self) -> Iterator[None]:
         """Compute in bfloat16 inside this context, if `train.bf16` is set and the device multiplies bfloat16 numbers.
 
-        A GPU does, and a CPU with AMX or AVX512-BF16. Other CPUs are slower in bfloat16. On a CPU attention then runs
+        GPUs do, and CPUs with AMX or AVX512-BF16. Other CPUs are slower in bfloat16. On a CPU, attention then runs
         without a fused kernel, because the fused kernel's backward pass takes four times as long.
         """
         gpu = self.device.type != "cpu"
@@ -324,7 +324,7 @@ def continued_target(
 ) -> CompactTarget:
     """Make a target that starts from the weights, action statistics and words of another target.
 
-    Only the query embeddings of a parallel target are newly initialised, and embedding and head if the tokens differ.
+    The query embeddings of a parallel target are newly initialised. So are embedding and head, if the tokens differ.
     The encoder of an added view is a copy of the first view's. The weights from an added view to the estimated object
     positions start at zero.
 

@@ -1,4 +1,4 @@
-"""`kerv prepare`: find out which artifacts the methods need for a target, and the commands that make them, in order."""
+"""`kerv prepare`: find the artifacts that the methods need for a target, and the commands that make them, in order."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Step:
         state: `there`, `missing`, `unfinished`, `of other artifacts` (it was made from artifacts that have been
             replaced since) or, while it trains, `step 300 of 4000`.
         command: Command-line arguments after `kerv` that make the artifact, without the arguments that all steps share.
-        steps: Number of optimisation steps. 0 if it is no training.
+        steps: Number of optimisation steps. 0 if the artifact is made without training.
     """
 
     kind: str
@@ -52,7 +52,8 @@ def plan(settings: PrepareSettings, database: Database) -> list[Step]:
     Raises:
         UsageError: The target or a method does not exist, or the target does not decode autoregressively and so needs
             no artifacts.
-        CheckpointError: The demonstrations do not exist. Or a folder for a new artifact holds one of another target.
+        CheckpointError: The demonstrations do not exist. Or a folder for a new artifact holds an artifact of
+            another target.
     """
     artifacts = Artifacts(settings.results, settings.policy)
     description = artifacts.description

@@ -35,7 +35,7 @@ function notes in the database that the work began.
 
 
 def quietly(kind: str, folder: Path, plan: str, units: int) -> Stage:
-    """Begin an artifact without a row in the database, and show no progress. This is the default for `Begin`."""
+    """Begin work on an artifact without a row in the database, and show no progress. The default for `Begin`."""
     return lambda title: nullcontext(lambda *done: None)
 
 

@@ -42,7 +42,7 @@ STATE_EPISODES = 200
 
 
 def train_target(settings: TrainTargetSettings, database: Database, begin: Begin = quietly) -> tuple[Path, Metrics]:
-    """Train a compact policy, from the resume file in its folder if there is one.
+    """Train a compact policy. If its folder holds a resume file, continue that training.
 
     Args:
         settings: Settings of `kerv train target`. This function fills in `demos`, `task` and `train.places`.
@@ -158,7 +158,7 @@ def settle_places(settings: TrainTargetSettings, dataset: DemoDataset) -> None:
 
 
 def initial_target(settings: TrainTargetSettings, camera: str, new: Path) -> Path | None:
-    """Return the folder of the target whose weights training starts from; None without `train.init`.
+    """Return the folder of the target whose weights training starts from. None if `train.init` is not set.
 
     Args:
         settings: Settings of the training.
@@ -166,7 +166,7 @@ def initial_target(settings: TrainTargetSettings, camera: str, new: Path) -> Pat
         new: Folder of the new target.
 
     Raises:
-        UsageError: The training would overwrite that target, or its shapes differ.
+        UsageError: The training would overwrite that target, or that target has other shapes than the new one.
         CheckpointError: The target `train.init` does not exist.
     """
     name = settings.train.init
@@ -187,7 +187,7 @@ def load_training(
     camera: str,
     progress: OnProgress,
 ) -> tuple[CompactTarget, Samples]:
-    """Read the demonstrations into memory, and make the network, from the weights of `init` if it is given.
+    """Read the demonstrations into memory, and make the network. It starts from the weights of `init` if given.
 
     Raises:
         CheckpointError: The demonstrations or the target `init` are damaged or of another environment.
@@ -218,7 +218,7 @@ def load_training(
 
 
 def state_range(dataset: DemoDataset) -> list[list[float]]:
-    """Return the range of each of the s numbers of a state: 0.1th percentiles (s,), then 99.9th percentiles (s,).
+    """Return the range of each of the s numbers of a state: two lists of s percentiles, the 0.1th and the 99.9th.
 
     The percentiles are measured on at most STATE_EPISODES episodes.
     """
