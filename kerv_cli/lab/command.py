@@ -27,10 +27,10 @@ def current_store() -> str:
 
 @contextlib.contextmanager
 def noted(words: Sequence[str]) -> Iterator[None]:
-    """Note a command's arguments (without `kerv`) during a `with` block. What is made in the block is stored with them.
+    """Set the current command's arguments (without `kerv`) to `words` during a `with` block.
 
-    At the end of the block the earlier arguments are restored, because `kerv prepare` runs other commands inside its
-    own.
+    Studies and artifacts (weights or data) that the block makes are stored with these arguments. At the end of the
+    block the earlier arguments are restored, because `kerv prepare` runs other commands inside its own block.
     """
     before = _words.set(tuple(words))
     try:
@@ -40,7 +40,7 @@ def noted(words: Sequence[str]) -> Iterator[None]:
 
 
 def without_passwords(url: str) -> str:
-    """Return a database's URL without the password before its host and without those in its query."""
+    """Return a database's URL without passwords. They can be before the host and in the query."""
     address, _, query = re.sub(r"(://[^/@:]*):[^/@]*@", r"\1@", url).partition("?")
     pairs = [one for one in query.split("&") if not unquote(one.partition("=")[0]).lower().endswith("password")]
     return "?".join(filter(None, (address, "&".join(pairs))))
@@ -51,11 +51,11 @@ def chosen_store(overrides: Iterable[str]) -> Iterator[list[str]]:
     """Use the database named by the override `store=URL` for the `with` block.
 
     Args:
-        overrides: Overrides of a command. Without `store=`, the database stays the one from before the block.
+        overrides: Overrides of a command. Without `store=`, the block uses the same database as the code before it.
 
     Yields:
-        The same overrides, but without the URL's password, so that it is never stored. The URL is quoted if Hydra needs
-        that.
+        The same overrides, but the URL has no password, so that the password is never stored. The URL is quoted if
+        Hydra needs quotes.
     """
     overrides, chosen = list(overrides), _store.get()
     for number, override in enumerate(overrides):

@@ -42,7 +42,7 @@ class Unanswered(StorageError):
 
 
 class Damaged(ValueError):
-    """A stored value is not what its column holds. `Database.reading` makes it a CheckpointError."""
+    """A stored value has the wrong type or form for its column. `Database.reading` raises a CheckpointError instead."""
 
 
 def _is_time(text: str) -> bool:
@@ -234,9 +234,9 @@ class Database:
 
     @property
     def store(self) -> str:
-        """The value of KERV_STORE with which other processes use this database, its password included.
+        """Value of KERV_STORE that makes other processes use this database. It includes the password.
 
-        Empty for the file in the results folder.
+        Empty for the SQLite file in the results folder.
         """
         if self.file is not None and self.file.absolute() == (self.results / FILE).absolute():
             return ""
@@ -244,7 +244,7 @@ class Database:
 
     @property
     def words(self) -> list[str]:
-        """Overrides that choose this database. They end the commands that a message or page tells the user to run.
+        """Overrides that choose this database. Messages and pages append them to the commands that they suggest.
 
         Empty for the SQLite file in the folder `results`.
         """
@@ -330,7 +330,7 @@ class Database:
 
     @contextlib.contextmanager
     def checking(self, what: str) -> Iterator[None]:
-        """Convert stored values in a `with` block. An error in the block is reported as damage of the database.
+        """Report errors in the `with` block as damage of the database. The block converts stored values.
 
         Args:
             what: What is converted, for the message.
@@ -365,16 +365,16 @@ class Database:
 
 
 def opened(results: str | Path) -> Database:
-    """Return the database of a results folder that the running command uses.
+    """Return the database that the running command uses for a results folder.
 
-    It is the one that `store=` or else the variable KERV_STORE names, or else the SQLite file in the folder. A command
-    calls this once and hands the database down.
+    `store=` names the database. Without it, the variable KERV_STORE does. Without both, it is the SQLite file in the
+    folder. A command calls this function once and passes the database on.
     """
     return Database(results, current_store())
 
 
 def clock(connection: sa.Connection) -> sa.ColumnElement[float]:
-    """Return the SQL expression of the time by the database's own clock, seconds since 1970."""
+    """Return an SQL expression for the current time in seconds since 1970, by the database's own clock."""
     if connection.dialect.name == "postgresql":
         return sa.literal_column("CAST(EXTRACT(EPOCH FROM clock_timestamp()) AS double precision)", sa.Double)
     return sa.literal_column("(julianday('now') - 2440587.5) * 86400.0", sa.Double)
@@ -492,9 +492,9 @@ def _created(connection: sa.Connection) -> int:
 
 
 def measures_in(connection: sa.Connection) -> list[sa.ColumnElement[Any]]:
-    """Return the table's columns with results of an episode (MEASURES), to select them.
+    """Return the columns with results (MEASURES) of the table of episodes, for use in a query.
 
-    A column that the table lacks, because an older kerv made the table, is null in every row.
+    If an older kerv made the table, columns may be missing. A missing column reads as null in every row.
     """
     stored = {column["name"] for column in sa.inspect(connection).get_columns(EPISODES.name)}
     return [EPISODES.c[one.name] if one.name in stored else sa.null().label(one.name) for one in MEASURES]

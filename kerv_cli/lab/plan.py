@@ -27,8 +27,8 @@ FULL_BATCHES = 16
 NEVER, TIMED, CHANGED, ALL = "never", "timed", "changed", "all"
 """Values of `rerun=`, which says which existing episodes to run again.
 
-NEVER: none. TIMED: those that did not take turns with all other settings in one block. CHANGED: those that other code
-ran. ALL: all.
+NEVER: none. TIMED: those that did not take turns with all other settings in one block. CHANGED: those that ran with
+another version of the code. ALL: all.
 """
 
 Key = tuple[str, str, int, int]
@@ -189,8 +189,8 @@ def split(
         episodes: The study's episodes.
         block: Number of seeds in a block, which one process runs.
         stored: Episodes in the database, by `Episode.key`.
-        rerun: Which existing episodes to run again: none (NEVER), those that did not take turns in one block (TIMED),
-            those that other code ran (CHANGED), or all (ALL).
+        rerun: Which existing episodes to run again: none (NEVER), those whose settings did not take turns in one block
+            (TIMED), those that ran with another version of the code (CHANGED), or all (ALL).
         since: Used only with ALL, if a command is resumed: the time at which it first began (ISO 8601). Episodes of
             blocks that began later count as existing, because this command ran them. Empty: all episodes run again.
         earlier: The newest stored setting and its hash, by label. Used to explain what has changed.
@@ -266,7 +266,7 @@ def _reasons(
 
 
 def grouped(episodes: Iterable[Episode], key: Callable[[Episode], K]) -> dict[K, list[Episode]]:
-    """Return the episodes in groups of equal keys."""
+    """Group episodes by the value that `key` returns for each of them."""
     groups: dict[K, list[Episode]] = {}
     for one in episodes:
         groups.setdefault(key(one), []).append(one)

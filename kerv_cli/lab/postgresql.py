@@ -23,7 +23,7 @@ class Connection(psycopg.Connection[Any]):
         """Wait for the answer to a statement.
 
         Raises:
-            OperationalError: Nothing has come from the server for STATEMENT_SECONDS and a few more.
+            OperationalError: The server has sent nothing for a few seconds more than STATEMENT_SECONDS.
         """
         try:
             return super().wait(_limited(gen, STATEMENT_SECONDS + _SPARE_SECONDS), *arguments, **options)

@@ -103,16 +103,16 @@ def time_left(row: RunRow) -> str:
 
 
 def time_of(database: Database, kind: str, command: Sequence[str], units: int = 0) -> str:
-    """Say how long a command will take, from an earlier one on this machine with the same options.
+    """Estimate how long a command will take, from an earlier command with the same options on this machine.
 
     Names, tasks and numbers of steps or episodes may differ. Of several earlier commands, the one with the most similar
-    number of units counts, then the newest. Resumed and repeated commands do not count.
+    number of units is used, then the newest. Resumed and repeated commands are not used.
 
     Args:
         database: The database.
         kind: Kind of the artifact that the command makes.
         command: Command-line arguments after `kerv`.
-        units: Number of steps or episodes. 0: as many as the earlier command.
+        units: Number of steps or episodes. 0: as many as the earlier command had.
 
     Returns:
         The duration and the earlier command's artifact as text. If there is no such command, the text says so.
@@ -148,7 +148,7 @@ def _options(command: Sequence[str]) -> set[str]:
 
 
 def pulse(database: Database) -> tuple[str, bool]:
-    """Return a short text that differs from the last one if the results folder has changed since.
+    """Return a short text that changes whenever the results folder changes, and whether a command is running.
 
     Returns:
         text: Changes with every heartbeat (sign of life), start or end of a command, and with every new episode.
@@ -166,9 +166,9 @@ def pulse(database: Database) -> tuple[str, bool]:
 class Run:
     """Writes the database row of a command, from its start to its end. Use it in a `with` statement.
 
-    A thread updates the row every few seconds (a heartbeat), so that others see that the command is alive. A command
-    that ends with a UsageError leaves no row, nor does one that made nothing because its input cannot be read (a
-    CheckpointError).
+    A thread updates the row every few seconds (a heartbeat), so that others see that the command is alive. The row is
+    deleted if the command ends with a UsageError. It is also deleted if the command made nothing because its input
+    cannot be read (a CheckpointError).
 
     Args:
         database: Where the row is written.
@@ -227,7 +227,7 @@ class Run:
 
         Args:
             done: Number of steps or episodes that are finished.
-            total: Number of steps or episodes in all; None to keep it.
+            total: Number of steps or episodes in all. None: the total does not change.
         """
         is_new = total not in (None, self.total)
         self.done, self.total = done, self.total if total is None else total
@@ -302,7 +302,7 @@ def command_to_go_on(database: Database, kind: str, folder: Path) -> tuple[str, 
 
 
 def interrupted(database: Database, kind: str, command: Sequence[str], name: str | None = None) -> RunRow | None:
-    """Return the oldest row of a command that was interrupted, perhaps several times, and did not complete since.
+    """Return the row of an interrupted command's first attempt, counted since the command last completed.
 
     Returns None if the command has no row or its newest row is complete. Also returns None if another command has made
     the same study or artifact since.
@@ -311,7 +311,7 @@ def interrupted(database: Database, kind: str, command: Sequence[str], name: str
         database: The database.
         kind: Kind of the study or artifact.
         command: Command-line arguments (without `kerv`).
-        name: Name of the study or artifact; None: as in the command's newest row.
+        name: Name of the study or artifact. None: the name in the command's newest row.
     """
     first, rows = None, run_rows(database, kind, name)
     name = next((row.name for row in rows if row.command == tuple(command)), None)

@@ -1,4 +1,4 @@
-"""A study: its settings and episodes, those of them that the database has, and those that are missing."""
+"""A study: its settings, its episodes that are in the database, and its missing episodes."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class Study:
         machines: Names of cost profiles of other machines, on which the report estimates the speeds.
         existing: Episodes that the database has, with their rows.
         missing: Episodes to run, each with the reason in a few words, such as `new seeds`.
-        newest: Largest row number among the stored episodes. Larger ones were written after the plan, by other sweeps.
+        newest: Largest row number among the stored episodes. Rows with larger numbers are from later sweeps.
         runtime: Executor, workers and device.
         command: Command-line arguments (without `kerv`) that resume the study.
 
@@ -157,7 +157,7 @@ class Study:
 
     @property
     def device(self) -> str:
-        """Device of the episodes to run. Empty if they need different ones."""
+        """Device of the episodes to run. Empty if they need different devices."""
         devices = {str(one.setting.settings["runtime"]["device"]) for one in self.to_run}
         return devices.pop() if len(devices) == 1 else ""
 
@@ -186,7 +186,7 @@ class Study:
             return connection.execute(sa.select(STUDIES).where(STUDIES.c.name == self.name)).first()
 
     def how_to_run(self) -> str:
-        """Return text for messages that says how to run the study: run `COMMAND`."""
+        """Return advice for error messages on how to run the study, such as: run `kerv sweep study=NAME`."""
         return f"run `{self.sweep_command()}`" if self.kind == SWEEP else f"run `kerv runs rerun {self.name}`"
 
     def sweep_command(self, *overrides: str) -> str:
@@ -279,15 +279,15 @@ class Study:
     def save(self) -> None:
         """Write the study's settings and its list of planned episodes.
 
-        If the study is stored already, its settings may list episodes of tasks that are not in this plan. They stay in
-        the list if their setting and the baseline are unchanged, and their seeds and repeats are within this plan's. So
-        sweeps of one study over different tasks give one report.
+        A study that is stored already may list episodes of tasks that are not in this plan. These episodes stay in the
+        list if their setting and the baseline are unchanged, and this plan has their seeds and repeats. So sweeps of
+        one study over different tasks give one report.
         """
         with self.database.writing() as connection:
             self.save_in(connection)
 
     def save_in(self, connection: sa.Connection) -> int:
-        """Do what `save` does, in a transaction of the caller. Return the study's row number."""
+        """Do the same as `save`, but in the caller's transaction. Return the study's row number."""
         about = {name: getattr(self, name) for name in ABOUT}
         row = connection.execute(sa.select(STUDIES).where(STUDIES.c.name == self.name)).first()
         if row is None:
@@ -415,7 +415,7 @@ class Study:
         return pa.concat_tables(tables, promote_options="default")
 
     def add(self, episodes: Iterable[ImportedEpisode], command: Sequence[str]) -> None:
-        """Write the study, whose episodes were run elsewhere, in one transaction.
+        """Write the study and its episodes, which were run elsewhere, in one transaction.
 
         Args:
             episodes: The episodes that were run, with their results.
@@ -435,7 +435,7 @@ class Study:
     def write(
         self, connection: sa.Connection, one: Episode, block: Mapping[str, Any], row: Mapping[str, Any], decodes: bytes
     ) -> None:
-        """Write an episode that has been run, and link it to the study. What is there already is not written again.
+        """Write an episode that has been run, and link it to the study. Rows that exist already are not changed.
 
         Args:
             connection: The database, in a transaction.
@@ -456,9 +456,9 @@ class Study:
         self.update(connection, one, episode_id=number, error=None)
 
     def update(self, connection: sa.Connection, one: Episode, **values: Any) -> None:
-        """Change the rows of WANTED (planned episodes) that stand for an episode in this study.
+        """Change this study's rows of an episode in the table WANTED (planned episodes).
 
-        There are several rows if settings with different labels have equal meaning, and so share the episode.
+        An episode has several rows if settings with different labels mean the same, and so share the episode.
         """
         settings = sa.select(SETTINGS.c.id).join(STUDIES).where(STUDIES.c.name == self.name)
         settings = settings.where(SETTINGS.c.work == one.setting.work)
@@ -468,8 +468,7 @@ class Study:
     def remove(self) -> None:
         """Delete the study, and its episodes that no other study uses.
 
-        Episodes that its commands ran but that it does not use any more, because `rerun=all` replaced them, are deleted
-        too.
+        Also delete episodes that `rerun=all` has replaced, if commands of this study ran them.
         """
         used = sa.select(WANTED.c.episode_id).select_from(PLANNED)
         used = used.where(WANTED.c.episode_id.is_not(None))
@@ -526,7 +525,7 @@ def setting_of(row: Any) -> Setting:
 
 
 def stored_settings(connection: sa.Connection, study: int) -> tuple[dict[int, Setting], tuple[Episode, ...]]:
-    """Return the settings of the study with this row number, by their ids, and its episodes."""
+    """Return a study's settings by their ids, and its episodes. `study` is the study's row number."""
     query = sa.select(SETTINGS).where(SETTINGS.c.study_id == study).order_by(SETTINGS.c.position)
     settings = {one.id: setting_of(one) for one in connection.execute(query)}
     wanted = sa.select(WANTED.c.setting_id, WANTED.c.task, WANTED.c.seed, WANTED.c.repeat)

@@ -49,8 +49,8 @@ FOLLOW_SECONDS = 0.3
 def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], kind: str = SWEEP) -> Study:
     """Check the settings of a sweep or a rollout. Find out which episodes are in the database, and which must run.
 
-    A rollout is a new one each time. But if the same command was interrupted before, the rest of its newest rollout is
-    planned instead.
+    Each call plans a new rollout, unless the same command was interrupted before. Then the rest of its newest rollout
+    is planned.
 
     Args:
         resolved: The study with all its settings.
@@ -103,14 +103,14 @@ def new_name(study: Study) -> str:
 class Outcome:
     """Result of `study.run`. Each episode of the study is in exactly one of the first three lists.
 
-    If workers of a cluster go on without this command (`detached`), the missing episodes are in none.
+    But if workers of a cluster go on without this command (`detached`), the missing episodes are in none of the lists.
 
     Attributes:
         done: Episodes that this command planned and that were run.
         reused: Episodes that were in the database already, or that another command planned and ran.
         failed: Settings that failed, with their episodes.
         seconds: Wall time.
-        detached: Says which workers of a cluster run the missing episodes. Empty: none do.
+        detached: Says which workers of a cluster run the missing episodes. Empty if no cluster runs them.
     """
 
     done: list[Episode] = field(default_factory=list)
@@ -206,7 +206,7 @@ def _kept(study: Study) -> str:
 
 
 class Progress:
-    """Collects the outcome of a plan: from the events of a worker in this process, and from the database.
+    """Collects the outcome of a plan, from the events of a worker in this process and from the database.
 
     Args:
         study: The study with its plan.
@@ -311,12 +311,12 @@ class Progress:
 class TimeLeft:
     """Estimates how long the missing episodes of a plan take, and corrects that with each episode that ends.
 
-    An episode is expected to take the mean time of its setting's episodes, or, if its setting has none, of all
-    episodes. The workers share the total equally.
+    An episode is expected to take the mean time of its setting's finished episodes. A setting without finished episodes
+    gets the average of the other settings' means. The workers share the total equally.
 
     Args:
         study: The study with its plan.
-        guess: Seconds per episode while nothing is measured.
+        guess: Seconds per episode while no episode is measured.
     """
 
     def __init__(self, study: Study, guess: float) -> None:
@@ -333,7 +333,7 @@ class TimeLeft:
         self.source = f"measured on {stored} stored episodes" if stored else f"a guess of {guess:g} s per episode"
 
     def see(self, event: Event) -> None:
-        """Take an event of the run: an episode that ended, or those that will not run."""
+        """Update the estimate with an event of the run: an episode that ended, or episodes that will not run."""
         if isinstance(event, EpisodeEnd):
             self._waiting[event.episode.setting.work] -= 1
             if event.seconds:

@@ -64,7 +64,7 @@ Save = Callable[[EpisodeRecord, Path, str], object]
 
 @dataclass(frozen=True)
 class Started:
-    """The run begins.
+    """A run of a study's missing episodes begins.
 
     Attributes:
         to_run: Number of episodes to run.
@@ -112,7 +112,7 @@ class EpisodeEnd:
         episode: The episode.
         success: Whether the task was solved.
         seconds: Wall time.
-        elsewhere: Whether another command than this one planned the episode.
+        elsewhere: Whether a command other than this one planned the episode.
     """
 
     episode: Episode
@@ -245,10 +245,10 @@ class Claim:
     Attributes:
         id: Row number of the block in the queue.
         run: Id of the command that planned it.
-        about: Executor and workers of that command.
+        about: Executor and number of workers of that command.
         block: The episodes to run.
         existing: Episodes of the block that others have run since the plan was made, with their rows.
-        killer: The episode in which two workers have died. None: there is none.
+        killer: The episode in which two workers have died. None if there is no such episode.
     """
 
     id: int
@@ -299,7 +299,7 @@ class Queue:
         A block is not free while another worker runs one of its episodes, for whichever study.
 
         Args:
-            ended: The block that this worker has just finished. It is removed from the queue. None: there is none.
+            ended: The block that this worker has just finished. It is removed from the queue. None: no such block.
         """
         with self.database.writing() as connection:
             if ended is not None:
@@ -387,7 +387,7 @@ class Queue:
         Args:
             connection: The database, in a transaction.
             claim: The block.
-            running: The episode that begins now. None: keep the stored one.
+            running: The episode that begins now. None: the stored episode does not change.
             **values: Further columns of the block's row to write.
 
         Raises:
@@ -432,7 +432,7 @@ class Queue:
                     connection.execute(freed.values(worker=None, heartbeat=None, running=None))
 
     def left(self) -> tuple[int, int]:
-        """Return how many blocks have not ended, and how many of them nobody has claimed.
+        """Return how many blocks have not ended, and how many of those no worker has claimed.
 
         This only reads the database, so no worker has to wait for it.
         """
@@ -455,7 +455,7 @@ class Queue:
             return bool(connection.execute(sa.update(QUEUE).where(died).values(heartbeat=0.0)).rowcount)
 
     def withdraw(self) -> None:
-        """Remove the blocks that nobody runs."""
+        """Remove from the queue all blocks that no worker is running."""
         with self.database.writing() as connection:
             connection.execute(sa.delete(QUEUE).where(self._mine(), _is_free(connection)))
 
@@ -469,7 +469,7 @@ def worker_id(pid: int, more: str = "") -> str:
 
     Args:
         pid: Id of the process.
-        more: Tells the workers of one process apart. Empty: the result is the prefix that all their names share.
+        more: Differs between the workers of one process. Empty: return the prefix that their names share.
     """
     return f"{socket.gethostname()}:{pid}:{more}"
 

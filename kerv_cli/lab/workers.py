@@ -1,8 +1,8 @@
 """Workers of a sweep, which are processes of `kerv work`: on this machine, or on a Slurm cluster.
 
-Those of this machine end when the sweep ends, however it ends. A cluster's are one array of jobs, which outlives the
-sweep that submitted it: a later sweep of the study finds it by its name. The nodes must share the results folder, or
-the database must be on a server.
+Workers on this machine end when the sweep ends, even if the sweep is killed. Workers on a cluster are one array of
+jobs, which can outlive the sweep. A later sweep of the same study finds the array by its name. The nodes must share
+the results folder, or the database must be on a server.
 """
 
 from __future__ import annotations
@@ -63,12 +63,12 @@ def last_line(text: str) -> str:
 
 
 def gpus_in_turn(device: str) -> list[str]:
-    """Return the GPUs that workers get in turn, as values of CUDA_VISIBLE_DEVICES.
+    """Return one value of CUDA_VISIBLE_DEVICES per GPU. Workers get these values in turn.
 
-    Empty: the workers see the same GPUs as this process.
+    If the list is empty, the workers see the same GPUs as this process.
 
     Args:
-        device: Device of the settings. A GPU with a number, as in `cuda:1`, is the same for all workers.
+        device: Device of the settings. If the GPU has a number, as in `cuda:1`, all workers use that GPU.
     """
     if device != "cuda":
         return []
@@ -81,7 +81,7 @@ def gpus_in_turn(device: str) -> list[str]:
 
 
 def disturbances(study: Study) -> list[str]:
-    """Return what disturbs the times of the episodes to run, a sentence each: workers that share a GPU or a CPU."""
+    """Return sentences about what will disturb the measured times: workers that share a GPU or the CPU's memory."""
     runtime = study.runtime
     if runtime.workers == 1 or runtime.executor != "local" or all(block.batch > 1 for block in study.blocks):
         return []
@@ -110,13 +110,13 @@ class _Worker:
 class LocalWorkers:
     """Processes of `kerv work`. Use it in a `with` statement, which ends them.
 
-    Each reads from a pipe that nobody writes to. When this process ends, even if it is killed, the pipe is closed, and
-    the workers end.
+    Each worker reads from a pipe that nobody writes to. When this process ends, even if it is killed, the pipe is
+    closed, and the workers end.
 
     Args:
-        queue: The blocks that they run.
-        number: Number of processes.
-        threads: Number of CPU threads of each.
+        queue: The blocks that the workers run.
+        number: Number of workers.
+        threads: Number of CPU threads per worker.
         gpus: Values of CUDA_VISIBLE_DEVICES, which the workers get in turn. Empty: the variable stays as it is.
     """
 
@@ -196,13 +196,12 @@ def _ask(program: str, *words: str, text: str = "", environment: dict[str, str] 
 class Array:
     """The workers of a study on a cluster: an array of Slurm jobs. Ctrl-C in its `with` statement cancels them.
 
-    If an array that an earlier sweep of the study submitted still waits or runs, it is used. Otherwise a new one is
-    submitted.
+    An array from an earlier sweep of the study is used if it still waits or runs. Otherwise a new one is submitted.
 
     Args:
         queue: The blocks.
         runtime: Number of workers, and the resources that each needs.
-        threads: Number of CPU threads of each.
+        threads: Number of CPU threads per worker.
 
     Raises:
         UsageError: This machine has no Slurm, or Slurm refuses the job.
