@@ -1,4 +1,4 @@
-"""Runs one episode: a decoder acts in a world (an open environment), which may go on while it decodes."""
+"""Runs one episode: a decoder acts in a world (an open environment), which may go on while the decoder works."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def steps_during(seconds: float, control_hz: float) -> int:
 
 
 class RealClock:
-    """Tells an episode how long each decode takes, and which of its actions are too old by then.
+    """Tells an episode how long each decode takes, and how many of the decoded actions are then too old to execute.
 
     Attributes:
         expected: Number of control steps that the next decode will probably take: as many as the last decode took.
@@ -55,7 +55,7 @@ class RealClock:
         self.expected = 0
 
     def delay(self, decode: DecodeRecord, observed: int) -> Delay:
-        """Return how long a decode takes in control steps, and how many of its actions are then too old to execute.
+        """Return how many control steps a decode takes, and how many of its actions are then too old to execute.
 
         Args:
             decode: Record of the decode.
@@ -73,8 +73,8 @@ class RealClock:
 def moved_after_approach(distances: Sequence[float], objects: Sequence[np.ndarray]) -> float:
     """Return the object's largest displacement, in metres, since the fingertips first came within AT_OBJECT of it.
 
-    Earlier motion does not count, because some objects fall into place at the start. The result is 0 if the fingertips
-    never came so close, and NaN if the task has no object.
+    Earlier motion is ignored, because some objects fall into place at the start. The result is 0 if the fingertips
+    never came that close, and NaN if the task has no object.
 
     Args:
         distances: Distance between fingertips and object after each step.

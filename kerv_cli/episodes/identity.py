@@ -56,8 +56,8 @@ class Setting:
         overrides: The overrides from which the setting is composed, as the user wrote them.
         settings: The rollout's settings as nested plain values, without the task.
         identity: Hashes of the weights and data that the setting reads.
-        varies: This setting's values of the keys that differ within its grid, by key. A grid is the settings that one
-            entry of the study expands into, because an override has several values.
+        varies: This setting's values for the keys that differ within its grid, by key. An entry of the study expands
+            into a grid of settings if an override has several values.
         name: Name of the grid. Empty: the label.
     """
 
@@ -78,9 +78,9 @@ class Setting:
 
     @property
     def depends_on_order(self) -> bool:
-        """Whether a result depends on the episodes before it in its block (group that one process runs).
+        """Whether an episode's result depends on earlier episodes of its block (episodes that one process runs).
 
-        It does if a skip rule adapts its threshold of similarity after each episode (docs/methods.md §4.3).
+        This is so if a skip rule adapts its similarity threshold after each episode (docs/methods.md §4.3).
         """
         skip = self.settings["skip"]
         return bool(skip.get("up") or skip.get("down"))
@@ -91,7 +91,7 @@ class Setting:
         return int(self.settings["rollout"]["batch"])
 
     def on(self, *tasks: str) -> RolloutSettings:
-        """Return the settings of a rollout on these tasks."""
+        """Return the settings of a rollout that runs this setting on the given tasks."""
         return read_settings(RolloutSettings, {**self.settings, "task": list(tasks)})
 
 

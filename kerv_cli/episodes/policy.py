@@ -47,8 +47,8 @@ def check(settings: RolloutSettings) -> dict[str, str]:
     """Refuse settings that cannot run, before anything slow starts.
 
     Returns:
-        The facts besides the settings that determine the results. They are the hashes of files with weights or data, by
-        the kind of file. The key `observation` says what the policy observes, such as `vision`.
+        What determines the results, apart from the settings: hashes of files with weights or data, by the kind of file.
+        The key `observation` says what the policy observes, such as `vision`.
 
     Raises:
         UsageError: A number is out of range, a seed is a training seed, the policy was trained on another camera, or
@@ -226,7 +226,7 @@ def _profile_path(settings: RolloutSettings) -> Path:
 
 
 def still_observation(decoder: ActionDecoder, space: ObservationSpace, pixels: int) -> Observation:
-    """Return an observation in which all that the decoder reads is 0. Images have `pixels` × `pixels` pixels."""
+    """Return an observation of zeros, with every input that the decoder reads. Images are `pixels` × `pixels`."""
     images = {name: np.zeros(frame_shape(name, pixels), dtype=np.uint8) for name in decoder.cameras}
     return Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
 
@@ -234,7 +234,7 @@ def still_observation(decoder: ActionDecoder, space: ObservationSpace, pixels: i
 def warm_up(
     decoder: ActionDecoder, task: str, space: ObservationSpace, pixels: int, decodes: int = WARM_UP_DECODES
 ) -> None:
-    """Run a few decodes before anything is timed, because first calls allocate memory and choose kernels.
+    """Run a few decodes before anything is timed, because the first decodes allocate memory and choose kernels.
 
     The simulated hand moves, so that parts that need past actions or positions run, too.
 

@@ -21,7 +21,7 @@ def repeating_words(settings: Plain, identity: Identity, typed: str, task: str, 
     Args:
         settings: The stored settings.
         identity: Hashes of the weights and data that they use.
-        typed: Overrides with which the setting was written in its study.
+        typed: Overrides that defined the setting in its study.
         task: Name of the task.
         seeds: Seeds of the episodes, which must be successive. All are recorded.
 

@@ -26,12 +26,12 @@ MOST_SEEDS = 10_000
 
 @dataclass(frozen=True)
 class Point:
-    """One setting of a study, given by its overrides. Overrides with several values give a grid of several points.
+    """One setting of a study, given by its overrides. Overrides with several values expand into a grid of points.
 
     Attributes:
         name: Name of the grid. All points of a grid have the same name.
         overrides: This point's overrides, `key=value`.
-        varies: This point's values of the keys that differ within the grid, by key.
+        varies: This point's values for the keys that differ within the grid, by key.
     """
 
     name: str
@@ -83,7 +83,10 @@ class ResolvedStudy:
 
     @property
     def unseen(self) -> dict[str, list[str]]:
-        """For each target that names its training tasks, those of the study's tasks that it was not trained on."""
+        """The study's tasks that a target was not trained on, by target.
+
+        Targets that do not name their training tasks are left out.
+        """
         found: dict[str, list[str]] = {}
         for one in self.settings.values():
             trained = () if one.policy.target in found else trained_tasks(one)
@@ -97,7 +100,7 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
 
     Args:
         overrides: The command line's `key=value` arguments. Settings of `kerv sweep`, such as `study` and `results`,
-            configure the sweep. `results` and all others apply to every setting of the study.
+            configure the sweep. `results` and all other overrides apply to every setting of the study.
 
     Raises:
         UsageError: A key or name is unknown. Or the study has no settings or lacks its baseline. Or one of its settings

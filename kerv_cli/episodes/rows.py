@@ -119,7 +119,7 @@ DECODE_SCHEMA = pa.schema([("index", INT), ("step", INT), *_schema(_DECODE)])
 
 
 def episode_row(record: EpisodeRecord) -> dict[str, Any]:
-    """Return the columns of one episode as values that JSON can store. NaN becomes None, in a list infinity, too."""
+    """Return the columns of one episode as JSON values. NaN becomes None. In lists, infinity becomes None, too."""
     return {name: _plain(value) for name, value in _row(_EPISODE, record).items()}
 
 

@@ -1,7 +1,8 @@
 """Runs episodes in the worlds (open environments) of this process: one after the other, or several at once.
 
 All settings in a process share weights, datastores and worlds. Each setting has its own decoder, because a skip rule
-may depend on earlier episodes. Each setting also renders its own images, so that none profits from another's caches.
+may depend on earlier episodes. Each setting also renders its own images, so that no setting gains from the caches of
+another.
 """
 
 from __future__ import annotations
@@ -223,7 +224,7 @@ def is_recorded(settings: RolloutSettings, seed: int) -> bool:
 
 
 def success_of(target: Target, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:
-    """Return the share in [0, 1] of successful episodes, over all pairs of a task and a seed.
+    """Run one episode per task and seed, and return the share of successful episodes, in [0, 1].
 
     The target decodes as it was trained to, autoregressively or in parallel.
     """
