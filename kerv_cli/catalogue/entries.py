@@ -69,13 +69,13 @@ class RunEntry:
         total: Number of episodes or training steps that were planned. 0 if unknown.
         done: How many of the planned ones are finished.
         left: While it runs, the estimated remaining time, such as `about 3 min left`.
-        message: Why the newest command that makes it failed.
+        message: Error message of the newest command that makes the entry. Empty if that command did not fail.
         figures: Main results of the entry by name, such as the success rate.
         command: Command-line arguments (without `kerv`) that made it. Empty if unknown.
         sha256: Hash by which other artifacts refer to it.
         made_from: Hashes of the artifacts that it was made from, by kind. If settings of a study use different
-            artifacts of a kind, the key of the second and later ones is `KIND of LABEL`, with the label of the setting.
-        labels: What people wrote about it, by kind: `tag` and `note`.
+            artifacts of a kind, the second and later artifacts have the key `KIND of LABEL`, with the setting's label.
+        labels: Texts that people wrote about the entry, with the keys `tag` and `note`.
     """
 
     id: str
@@ -393,8 +393,8 @@ def _made_from(value: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[
 def parents(run: RunEntry, runs: Sequence[RunEntry]) -> dict[str, str]:
     """Return the names of the artifacts that an entry was made from, by kind.
 
-    The name is the id of another entry, or `shipped` and the name of a policy that kerv ships. For an artifact that is
-    neither, it is the first 12 digits of the hash.
+    The name is the id of another entry, or `shipped` and the name of a policy that kerv ships. For any other artifact,
+    the name is the first 12 digits of its hash.
     """
     names = {other.sha256: other.id for other in runs if other.sha256}
     for folder in visible(shipped_dir()):
@@ -469,7 +469,7 @@ def remove(run: RunEntry, database: Database) -> None:
 
 
 def plan_of(run: RunEntry, database: Database) -> Study:
-    """Plan to run a sweep or a rollout again. If an earlier repetition was interrupted, plan the rest of that one.
+    """Plan to run a sweep or rollout again. If an earlier repetition was interrupted, plan the rest of that repetition.
 
     Args:
         run: The sweep or rollout to repeat.

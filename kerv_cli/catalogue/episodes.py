@@ -1,4 +1,4 @@
-"""Find stored episodes: all of a study with their outcomes, or one by its row number."""
+"""Find stored episodes: all episodes of a study with their outcomes, or one episode by its row number."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LARGEST_ID = 2**31 - 1
 
 
 def settings_in(store: Study) -> tuple[str, dict[str, Setting]]:
-    """Return the baseline's label and all settings of a study by label, in the study's order.
+    """Return the label of a study's baseline, and all settings of the study by label, in the study's order.
 
     Raises:
         UsageError: There is no such study.
@@ -38,7 +38,7 @@ def settings_in(store: Study) -> tuple[str, dict[str, Setting]]:
 def outcomes(store: Study, task: str = "", seed: int | None = None) -> list[Any]:
     """Return one row for every label, task and seed of a study, in the study's order.
 
-    Of repeats (further measurements of the same episode) only the first is returned: all have the same outcome.
+    If an episode was measured several times, only the first repeat is returned, because all have the same outcome.
 
     Args:
         store: The study.

@@ -1,7 +1,7 @@
 """Imports evaluations that vla-eval ran. They become one study, with one setting per imported path.
 
 A vla-eval recording is a SQLite file. If a kerv server decoded the episodes, their decodes are imported too
-(`read_served`). Of other servers only success and number of steps are known.
+(`read_served`). For other servers only success and number of steps are known.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class RecordedEpisode:
     Attributes:
         task: Name of the task.
         index: Number of the episode within the task.
-        seed: Seed of the initial state. If the benchmark does not name it, the index.
+        seed: Seed of the initial state. It equals `index` if the benchmark does not name a seed.
         success: Whether the task was solved.
         steps: Number of control steps.
         seconds: Wall time.
@@ -158,10 +158,10 @@ def import_evaluations(
 
 
 def read_evaluations(path: Path) -> list[Evaluation]:
-    """Read the evaluations in a recording, or in a folder of recordings. All must be of the same model server.
+    """Read the evaluations in a recording, or in a folder of recordings. All must be from the same model server.
 
     Raises:
-        UsageError: There is no recording, no recording has an episode, or they are of several servers.
+        UsageError: There is no recording, no recording has an episode, or the recordings are from several servers.
         CheckpointError: A file is damaged or incomplete.
     """
     files = sorted(path.glob("[!.]*.sqlite")) if path.is_dir() else [path]
@@ -380,11 +380,11 @@ def path_of(results: Path, evaluation: str, episode: str) -> Path | None:
 
 
 def write_served(path: Path, record: EpisodeRecord, started: str, by: Mapping[str, Any]) -> None:
-    """Write to a file an episode that a kerv server decoded.
+    """Write one episode, which a kerv server decoded, to a file.
 
     Args:
         path: The file.
-        record: The episode. If the end effector's path is unknown, `record.path` has the shape (0, 3).
+        record: The episode. If the positions of the end effector are unknown, `record.path` has the shape (0, 3).
         started: Time at which the episode began (ISO 8601).
         by: Facts about the server (`Policy.facts`).
 

@@ -58,7 +58,7 @@ def import_databases(database: Database, files: Sequence[Path], name: str = "") 
     Args:
         database: The database to copy to.
         files: Database files to copy from.
-        name: New name of the study. Each file must then hold exactly one. Empty: keep the names.
+        name: New name of the study. Each file must then hold exactly one study. Empty: keep the names.
 
     Returns:
         Names of the imported studies, and a line of text about each study that was left out.
@@ -87,7 +87,7 @@ def import_databases(database: Database, files: Sequence[Path], name: str = "") 
 
 
 def database_in(path: Path) -> Path | None:
-    """Return the database file: `path` itself, or kerv.db in it if it is a folder. None if that is no database.
+    """Return the database file: `path` itself, or kerv.db in the folder `path`. None if that file is no database.
 
     Raises:
         UsageError: The path does not exist.
@@ -102,7 +102,7 @@ def connect_foreign(path: Path, **options: Any) -> sqlite3.Connection:
     """Open a SQLite file from somebody else, read-only.
 
     A small file can contain an endless query. So a connection may execute only a limited number of SQLite's
-    instructions, which grows with the file's size. After that, its queries fail.
+    instructions. The limit grows with the file's size. Beyond the limit, the connection's queries fail.
 
     Args:
         path: The file.
@@ -216,7 +216,7 @@ def _damage(path: Path) -> Iterator[None]:
 
 
 def export_database(study: Study, folder: Path) -> Path:
-    """Write a kerv.db with a single study into a folder, and return the file. An existing kerv.db is replaced.
+    """Write a study into a new kerv.db in a folder, and return that file's path. An existing kerv.db is replaced.
 
     Raises:
         UsageError: The folder contains other files.
