@@ -149,12 +149,12 @@ def load_study(name: str, results: str | Path = "results", store: str = "") -> S
     """Return an existing sweep or rollout.
 
     Args:
-        name: Its name or a unique part of it, `last`, or the path of a study's file.
+        name: The study's name or a unique part of the name, `last` for the newest, or the path of a study's file.
         results: Folder that kerv writes to.
         store: URL of the database. Empty: the environment variable KERV_STORE, else SQLite in the folder.
 
     Raises:
-        UsageError: Nothing matches the name, several things match, or the match is no sweep or rollout.
+        UsageError: Nothing matches the name, several entries match, or the match is no sweep or rollout.
     """
     with chosen_store([f"store={store}"] if store else []):
         database = opened(results)
@@ -187,7 +187,7 @@ class Policy:
         info: Description of inputs and outputs: cameras, image_size (pixels), names of the numbers in the state, names
             and limits of the D numbers of an action, control_hz, chunk (H, the most actions in an answer).
         last: The last answer with all details, such as `policy_timing` (milliseconds) and `decode` (forwards, tokens,
-            mode). Empty before the first.
+            mode). Empty before the first answer.
     """
 
     def __init__(self, served: Served) -> None:

@@ -1,1 +1,1 @@
-"""The `kerv` command: one file per command. Parse, call one function below, print."""
+"""The `kerv` command: one file per command. Each file parses, calls one function of a lower layer, and prints."""

@@ -32,7 +32,7 @@ class Commands(FastFlags, TyperGroup):
     prefix = ""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Return the words that can be typed next."""
+        """Return the words that can be typed after the group's name."""
         return list(dict.fromkeys(name.removeprefix(self.prefix).split()[0] for name in commands(self.prefix.strip())))
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
@@ -48,7 +48,7 @@ class Commands(FastFlags, TyperGroup):
         return family
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        """Find the command that the arguments begin with. Two words are tried first, as in `demos import`.
+        """Find the command that the arguments begin with. Names of two words, as in `demos import`, are tried first.
 
         Returns:
             The command's name, the command, and the arguments after it.

@@ -1,4 +1,4 @@
-"""Declare the commands of `kerv`: the decorator `command` makes a function a command of that name.
+"""Declare the commands of `kerv`: the decorator `command(NAME)` turns a function into the command `kerv NAME`.
 
 The decorator puts the function into kerv's registry. From that entry (a `Part` of kind `command`) this module makes
 typer's command with its options, settings, help and completion. The function can have these parameters:
@@ -246,7 +246,7 @@ def _settings(part: Command, overrides: list[str], cfg: bool) -> Any:
 
 
 class FastFlags:
-    """Makes a flag that is not typed False instead of None. Typer would import pydantic to convert None."""
+    """Sets each flag that is not typed to False instead of None. Typer would import pydantic to convert None."""
 
     def get_params(self, ctx: Any) -> list[Any]:
         """Return the options of the command."""
@@ -286,7 +286,7 @@ class CommandWithSettings(FastFlags, TyperCommand):
         return [CompletionItem(word) for word in complete(self.part, ctx.args, incomplete)]
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return the words of the help's first line."""
+        """Return the words of the help's first line, which says how to type the command."""
         return [*super().collect_usage_pieces(ctx), "[NAME]..." if self.part.names else "[KEY=VALUE]..."]
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:

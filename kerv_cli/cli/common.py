@@ -162,12 +162,12 @@ def _parse_error(error: Any, words: Sequence[str]) -> str:
 
 
 def results_word(overrides: Iterable[str]) -> str:
-    """Return ` results=DIR` and ` store=URL` as far as the overrides contain them, to append to a suggested command."""
+    """Return the typed ` results=DIR` and ` store=URL`, to append to a suggested command. Empty without both."""
     return "".join(f" {quoted(word)}" for word in overrides if word.startswith(("results=", "store=")))
 
 
 def quoted(word: str) -> str:
-    """Return a word as a shell reads it. Quotes are double: commands in messages are in single ones."""
+    """Quote a word for the shell if needed. Quotes are double, because messages put commands in single quotes."""
     if shlex.quote(word) == word:
         return word
     return '"' + re.sub(r'(["$`\\])', r"\\\1", word) + '"'
@@ -185,7 +185,7 @@ def _refuse(message: str, code: int, error: BaseException | None, words: Sequenc
 
 
 def with_results(message: str, words: Iterable[str]) -> str:
-    """Append the `results=` and `store=` that were typed to the quoted commands of a message that lack them.
+    """Append the `results=` and `store=` that the user typed to every quoted command in a message that lacks them.
 
     Args:
         message: The message, with commands as in `'kerv calibrate task=reach'`.

@@ -61,7 +61,7 @@ def line_of(command: Sequence[str], overrides: Sequence[str]) -> list[str]:
 
     Args:
         command: The step's own arguments.
-        overrides: Overrides of `kerv prepare`. Those that the step has, too, are appended.
+        overrides: Overrides of `kerv prepare`. An override is appended if the step has the same setting.
     """
     line = list(command)
     for word in overrides:
@@ -72,7 +72,7 @@ def line_of(command: Sequence[str], overrides: Sequence[str]) -> list[str]:
 
 
 def unsolved_by(settings: PrepareSettings) -> str:
-    """Return a sentence if the test for the certificate has shown that the policy does not solve its tasks, else ""."""
+    """Return a sentence if the certificate's test has shown that the policy does not solve its tasks. Otherwise ""."""
     from kerv_cli.methods.artifacts import Artifacts
     from kerv_cli.methods.certified.certificate import CertificateArtifact
     from kerv_cli.report.verdict import SOLVED, unsolved
