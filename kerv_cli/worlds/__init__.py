@@ -1,7 +1,7 @@
 """Find environments, their tasks and suites (named groups of tasks) by name.
 
-This package registers Meta-World and LIBERO. Importing it loads nothing heavy: numpy is imported with an environment's
-specification, and the simulator with its world.
+This package registers Meta-World and LIBERO. Importing the package loads nothing heavy. numpy is imported with an
+environment's specification, and the simulator when a world is opened.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ class Finding:
 
 
 def need(holds: object, message: str) -> None:
-    """Raise KervError with the message if `holds` is false."""
+    """Raise a KervError with this message if `holds` is false."""
     if not holds:
         raise KervError(message)
 

@@ -1,4 +1,4 @@
-"""Compute lengths of vectors that have the same last bit on every CPU.
+"""Compute lengths of vectors. The results are equal on every CPU, to the last bit.
 
 numpy's norms call OpenBLAS, which rounds differently on different CPUs. Random numbers and simulations must not depend
 on the CPU.

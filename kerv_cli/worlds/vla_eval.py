@@ -80,7 +80,7 @@ class MetaWorld(StepBenchmark):
         self.world: World | None = None
 
     def get_tasks(self) -> list[dict[str, Any]]:
-        """Return the tasks. The suite of each is its difficulty group."""
+        """Return the tasks. Each task's suite is the task's difficulty group."""
         tasks = (self.spec.tasks[name] for name in self.tasks)
         return [{"name": t.name, "suite": t.difficulty, "instruction": t.instruction, "seed": self.seed} for t in tasks]
 

@@ -52,7 +52,7 @@ class DemoEpisode:
         task: Full name of the task.
         seed: Seed of the episode.
         perturbed: Whether noise was added to the executed actions, or an actor moved the robot instead of the expert.
-        steps: T.
+        steps: T, the number of control steps.
         frames: (n, size, size x views, 3) uint8, the recorded images.
         frame_steps: (n,) int64. Image i was drawn before the action of control step `frame_steps[i]`.
         states: (T, s) float32, privileged state before each action. It begins with the proprioception.
@@ -298,9 +298,9 @@ _WIDTHS = {"BOOLEAN": 1, "INT32": 4, "FLOAT": 4, "INT64": 8, "DOUBLE": 8, "INT96
 
 @contextlib.contextmanager
 def memory_limit(size: int) -> Iterator[None]:
-    """Let this process take at most `size` bytes of memory inside the `with` block, beyond what it has.
+    """Let this process take at most `size` more bytes of memory inside the `with` block.
 
-    A file of any origin may need more than it states. Outside Linux this does nothing.
+    A file of any origin may need more memory than it states. Outside Linux this does nothing.
 
     Raises:
         MemoryError: The code inside the block needs more memory.
@@ -375,7 +375,7 @@ def _expanded(metadata: pq.FileMetaData, group: int, columns: Sequence[str]) -> 
     """Return how many bytes some columns of a row group take in memory, as far as the file states it.
 
     Returns:
-        size: All columns, at most. Text and bytes that repeat count once, unless they are in lists.
+        size: All columns, at most. Repeated text and bytes count once, unless they are in lists.
         text: Text and bytes alone, each counted once. At least 1.
     """
     chunks, rows = metadata.row_group(group), metadata.row_group(group).num_rows

@@ -181,8 +181,8 @@ class Source:
 
         Args:
             episode: The episode's row in meta/episodes.
-            columns: Prefix of the two columns of that row that say which file it is. `data` stands for
-                `data/chunk_index` and `data/file_index`.
+            columns: Prefix of the row's two columns that identify the file. `data` stands for `data/chunk_index` and
+                `data/file_index`.
             form: Template of the path, such as `DATA`.
 
         Raises:
@@ -503,7 +503,7 @@ def _episode(
 
 
 def action_space(source: Source, settings: DemosImportSettings, actions: np.ndarray) -> ActionSpace:
-    """Return the action space of a LeRobot dataset. Its limits are the smallest and largest recorded values.
+    """Return the action space of a LeRobot dataset. Its limits are the smallest and largest recorded actions.
 
     Args:
         source: The dataset.

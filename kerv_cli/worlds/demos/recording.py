@@ -53,7 +53,7 @@ class DemoConfig:
         tasks: Tasks and suites of one environment.
         episodes: Number of successful episodes per task.
         first_seed: First seed of every task. It must be a training seed.
-        perturbed: Share of episodes that are executed with noise. `is_perturbed` says which.
+        perturbed: Share of episodes that are executed with noise. `is_perturbed` says which episodes they are.
         camera: View of the recorded images. Default: the environment's first camera.
         frame_stride: Record an image at every n-th control step.
         tail: Number of labels to record after the success. Action chunks that begin near the end need them.
@@ -169,8 +169,8 @@ def record(
 ) -> DemoManifest:
     """Record demonstrations into a folder. If the recording was interrupted, continue it.
 
-    If the expert fails for a seed, the next seed after the requested range replaces it. If more fail than may be
-    replaced, episodes are missing. The recorded episodes do not depend on the number of workers.
+    If the expert fails for a seed, the next seed after the requested range replaces it. If too many seeds fail, the
+    dataset has fewer episodes than requested. The recorded episodes do not depend on the number of workers.
 
     Args:
         config: What to record.

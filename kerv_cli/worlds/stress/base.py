@@ -53,8 +53,8 @@ class ModelChanges:
 class Stress:
     """A disturbance of known size, drawn anew for every episode. This base class changes nothing.
 
-    A subclass overrides `change`, `act` or `see`. It takes random numbers only from `generator`. So every method meets
-    the same disturbance.
+    A subclass overrides `change`, `act` or `see`. It takes random numbers only from `generator`. So every decoding
+    method meets the same disturbance.
 
     Attributes:
         kind: Name of the kind of stress.
@@ -141,7 +141,7 @@ def factor_or_inverse(random: np.random.Generator, factor: float) -> float:
 
 
 def robot_roots(model: Model) -> set[int]:
-    """Return the ids of the robots' root bodies: the root above every body that an actuator moves."""
+    """Return the ids of the robots' root bodies. A root is a robot's if an actuator moves it or a body below it."""
     import mujoco
 
     joints = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)

@@ -104,7 +104,7 @@ def _random_turn(random: np.random.Generator, degrees: float) -> Rotation:
 
 
 def scenery_of(model: Model) -> list[int]:
-    """Return the ids of the geoms (shapes) that are scenery, which is background or table."""
+    """Return the ids of the geoms (shapes) of the scenery: background and table."""
     import mujoco
 
     robots, plane = robot_roots(model), mujoco.mjtGeom.mjGEOM_PLANE
