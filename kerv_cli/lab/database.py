@@ -106,7 +106,7 @@ def _required(kind: Any, *names: str) -> list[sa.Column[Any]]:
 
 
 def _to(name: str, column: str, **options: Any) -> sa.Column[Any]:
-    """Return a column that refers to a row of another table. A row is deleted together with the one it refers to."""
+    """Return a column that refers to a row of another table. A row is deleted together with that other row."""
     return sa.Column(name, sa.ForeignKey(column, ondelete="CASCADE"), **options)
 
 
@@ -417,7 +417,7 @@ def _file(path: Path) -> sa.Engine:
 def _connection(path: Path) -> sqlite3.Connection:
     """Open a SQLite file. Create nothing if this user cannot write the file or its folder.
 
-    Such a user reads through the log of a process that is writing. Without a log the file has everything.
+    Such a user reads the file and the log of a process that is writing. Without a log, the file has all rows.
     """
     options: Any = {"uri": True, "timeout": LOCK_SECONDS, "check_same_thread": False}
     uri = path.absolute().as_uri()
@@ -442,7 +442,7 @@ def _log(path: Path) -> bool:
 
 
 def _changed(path: Path) -> int:
-    """Return when a file was changed last, ns."""
+    """Return the time of a file's last change, in nanoseconds."""
     return path.stat().st_mtime_ns
 
 

@@ -223,7 +223,7 @@ def split(
 def _rows_of_turn(
     turn: Sequence[Episode], usable: Mapping[Episode, Sequence[StoredEpisode]]
 ) -> dict[Episode, StoredEpisode]:
-    """Choose a stored row for each episode that has some: of the block that ran most of the turn, then the newest."""
+    """Choose one row per stored episode: from the block that ran most of the turn, or else the newest."""
     in_block: Counter[str] = Counter()
     for one in turn:
         in_block.update(map(attrgetter("block"), usable[one]))

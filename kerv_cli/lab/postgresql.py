@@ -33,7 +33,7 @@ class Connection(psycopg.Connection[Any]):
 
 
 def _limited(gen: Any, seconds: float) -> Generator[Any, Any, Any]:
-    """Forward a generator of psycopg, which yields what it waits for and is sent 0 while nothing has come.
+    """Forward a generator of psycopg, with a time limit. It yields what it waits for, and gets 0 while nothing comes.
 
     Raises:
         TimeoutError: Nothing has come for this many seconds.

@@ -156,7 +156,7 @@ def run(study: Study, on_event: OnEvent = lambda event: None, *, save: Save = la
 
 
 class Detached(Interrupted):
-    """The workers of a cluster go on without this command. The message says which."""
+    """The workers of a cluster go on without this command. The error's message names the workers."""
 
 
 def run_blocks(study: Study, prepare: Prepare, record: Run, on_event: OnEvent) -> Outcome:

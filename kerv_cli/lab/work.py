@@ -101,7 +101,7 @@ class Preparing:
 
 @dataclass(frozen=True)
 class BlocksWait:
-    """Other processes run all blocks (groups of episodes) that are left. The worker waits, in case one of them dies."""
+    """Other processes run all remaining blocks (groups of episodes). The worker waits, in case a process dies."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ def work_on(study: Study, run_id: str, on_event: OnEvent, save: Save) -> None:
 
     Raises:
         UsageError: The study is not in the database, or its device is not on this machine.
-        CheckpointError: Weights or data in this results folder are not those with which the study was planned.
+        CheckpointError: Weights or data in this results folder differ from those with which the study was planned.
         StorageError: The disk is full or not writable, or the database does not answer.
     """
     if not run_id:  # a sweep of this machine has checked its settings
@@ -296,7 +296,7 @@ class Queue:
     def claim(self, ended: Claim | None = None) -> Claim | None:
         """Claim the first free block. Return None if none is free now.
 
-        A block is not free while another worker runs one of its episodes, for whichever study.
+        A block is not free while another worker runs one of its episodes, even for another study.
 
         Args:
             ended: The block that this worker has just finished. It is removed from the queue. None: no such block.
@@ -321,7 +321,7 @@ class Queue:
         return self._claim_of(row, killer)
 
     def _first_free(self, connection: sa.Connection) -> Any:
-        """Return the first free row that nobody else runs an episode of. None: there is none."""
+        """Return the first free row of which no other worker runs an episode. None if there is no such row."""
         query = sa.select(QUEUE).where(self._mine(), self._is_open(connection))
         query = query.order_by(QUEUE.c.position, QUEUE.c.id)
         held: dict[str, set[tuple[Any, ...]]] = {}
@@ -335,7 +335,7 @@ class Queue:
                 return row
 
     def _held_outside(self, connection: sa.Connection, run: str) -> set[tuple[Any, ...]]:
-        """Return the keys of the episodes that other workers run for other commands. Blocks of one command differ."""
+        """Return the keys of episodes that other workers run for other commands. One command's blocks share none."""
         query = sa.select(QUEUE.c.episodes).join(STUDIES, STUDIES.c.id == QUEUE.c.study_id)
         query = query.where(QUEUE.c.run != run, QUEUE.c.worker != self.worker, ~_is_free(connection))
         # rollouts share no episodes with other studies
@@ -496,12 +496,12 @@ class _Attempt:
     """A block that this process runs.
 
     Attributes:
-        queue: Where it comes from.
+        queue: The queue from which the block was claimed.
         claim: The block.
         prepare: Builds a setting's decoder for a task.
         on_event: Called with each event.
         load: Load average per core when the worker began.
-        started: When it began (ISO 8601).
+        started: Time at which the block began (ISO 8601).
         left: Episodes that have neither ended nor failed, in the order in which they run.
         running: The episode that the database knows to be running.
         failed: Episodes that have failed.
@@ -565,7 +565,7 @@ class _Attempt:
                     self._end(one, record, order, started)
 
     def _try(self, one: Episode, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call a function for episode `one`. If it raises, its setting has failed: return None."""
+        """Call a function for episode `one`. If it raises, note that the episode's setting failed, and return None."""
         self._begin(one)
         try:
             return function(*arguments)
@@ -610,7 +610,7 @@ class _Attempt:
         self.on_event(EpisodeEnd(one, bool(row["success"]), float(row["wall_seconds"])))
 
     def _write(self, one: Episode, row: dict[str, Any], decodes: bytes) -> None:
-        """Write an episode and its decodes, link the episode to the study, and begin the next, in one transaction."""
+        """Write an episode and its decodes, link the episode to the study, and begin the next one. One transaction."""
         block = self._row  # computed before others have to wait
         with self.queue.database.writing() as connection:
             self.queue.hold(connection, self.claim, self.running)

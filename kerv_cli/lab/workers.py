@@ -44,7 +44,7 @@ _LOOK_SECONDS = 5.0
 
 
 def worker_command(queue: Queue, threads: int, **settings: str) -> tuple[list[str], dict[str, str]]:
-    """Return the command line of a worker of a queue's study, and its environment.
+    """Return the command line and the environment variables that start a worker for a queue's study.
 
     Args:
         queue: The blocks.
