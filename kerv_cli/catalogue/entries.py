@@ -58,7 +58,7 @@ class RunEntry:
     """One entry of the list that `kerv runs` shows: a study, an artifact, or an interrupted command.
 
     Attributes:
-        id: Name in commands.
+        id: Name by which commands find the entry.
         kind: sweep, rollout, import, or a kind of artifact.
         folder: Folder of its files.
         started: Start time in UTC (ISO 8601). For an artifact, the time when its newest file changed.
@@ -67,9 +67,9 @@ class RunEntry:
         tasks: Names of its tasks.
         episodes: Number of its stored episodes.
         total: Number of episodes or training steps that were planned. 0 if unknown.
-        done: How many of the planned ones are finished.
+        done: Number of planned episodes or training steps that are finished.
         left: While it runs, the estimated remaining time, such as `about 3 min left`.
-        message: Error message of the newest command that makes the entry. Empty if that command did not fail.
+        message: Error message of the newest command that makes the entry. Empty if there is none.
         figures: Main results of the entry by name, such as the success rate.
         command: Command-line arguments (without `kerv`) that made it. Empty if unknown.
         sha256: Hash by which other artifacts refer to it.
@@ -155,12 +155,12 @@ def find_runs(database: Database) -> list[RunEntry]:
 
 
 def _with_command(entry: RunEntry, row: RunRow, is_finished: bool) -> RunEntry:
-    """Return an entry with what the newest command that makes it says.
+    """Return an entry with the state, progress and message of the newest command that makes it.
 
     Args:
         entry: The entry, as its rows and files describe it.
         row: The command.
-        is_finished: Whether the same command has finished once. Repeating it in vain does not harm an artifact.
+        is_finished: Whether the same command has finished once. Then a failed repetition leaves the artifact complete.
     """
     entry, is_running = replace(entry, command=row.command), row.status == RUNNING
     is_repeat = is_finished and entry.state == COMPLETE

@@ -74,7 +74,7 @@ class FoundEpisode:
         id: Row number of the episode.
         store: The study.
         episode: Setting, task, seed and repeat.
-        row: Columns of the table `episodes`, without `decode_seconds`, and of its setting.
+        row: Columns of the table `episodes`, without `decode_seconds`, and columns of the episode's setting.
         about: Machine and versions that ran it.
         earlier: Seeds that must run before this episode, in this order, so that it gives the same tokens again. Empty
             unless the setting's skip rule adapts from episode to episode.

@@ -112,10 +112,10 @@ def import_evaluations(
 
     Args:
         database: The database to write to.
-        paths: One path per setting: a vla-eval recording, or a folder that contains some.
+        paths: One path per setting: a vla-eval recording, or a folder of recordings.
         name: Name of the study. Empty: made from the benchmarks' names.
         labels: A label for each path. Empty: the servers' names.
-        baseline: Label of the baseline. Empty: ar if there is one, or else the first label.
+        baseline: Label of the baseline. Empty: `ar` if there is such a label, or else the first label.
         words: Command-line arguments (without `kerv`) of the import.
 
     Returns:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class DoctorSettings(RunSettings):
-    """Settings of `kerv doctor`. If a target or an environment is given, only these are checked."""
+    """Settings of `kerv doctor`. If a target or an environment is given, nothing else is checked."""
 
     groups: ClassVar = {"world": "default", "runtime": "cpu"}
 

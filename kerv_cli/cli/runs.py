@@ -291,7 +291,7 @@ def export(
 
 @dataclass(kw_only=True)
 class ImportSettings(CommandSettings):
-    """Settings of `kerv runs import`. They are for recordings of vla-eval, which become a study (docs/vla_eval.md)."""
+    """Settings of `kerv runs import`. They apply only to recordings of vla-eval (docs/vla_eval.md)."""
 
     name: str = setting("", "name of the study; empty: the names of its benchmarks")
     baseline: str = setting("", "label of the setting that others are compared with; empty: ar, else the first one")

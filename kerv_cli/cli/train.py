@@ -48,7 +48,7 @@ def drafter(settings: TrainDrafterSettings, plan: ShowPlan = False, as_json: AsJ
 
 
 def _train(train: Callable[..., tuple[Path, dict[str, float]]], settings: Any, plan: bool, as_json: bool) -> None:
-    """Train, and print the metrics of the best weights, and where they and the curves are."""
+    """Train. Print the metrics of the best weights, their folder, and the paths of the training curves."""
     from kerv_cli.report.plots import save_curves
 
     with as_planned(settings, plan, as_json) as (database, begin):

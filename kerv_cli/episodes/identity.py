@@ -316,7 +316,7 @@ def code_hash() -> str:
 def _meaning(source: bytes) -> bytes:
     """Return the syntax tree of Python source without its docstrings, as the bytes of a text.
 
-    The text is the same in every version of Python. That of `ast.dump` is not.
+    The text is the same in every version of Python. The text from `ast.dump` is not.
     """
     return json.dumps(_plain(ast.parse(source))).encode()
 
@@ -324,7 +324,7 @@ def _meaning(source: bytes) -> bytes:
 def _plain(node: object) -> object:
     """Return a syntax tree without docstrings as lists and strings.
 
-    What only some versions of Python have is left out: empty fields, and empty strings in f-strings.
+    Parts that only some versions of Python have are left out: empty fields, and empty strings in f-strings.
     """
     if isinstance(node, list):
         return [_plain(one) for one in node if not _is_docstring(one)]

@@ -130,7 +130,7 @@ def find_backend() -> tuple[str, str]:
 
 
 def _draws(backend: str) -> bool:
-    """Return whether a backend can draw here, which is tried in its own process."""
+    """Return whether a backend can draw here. The attempt runs in a process of its own."""
     environment = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
     command = [sys.executable, "-c", _PROBE]
     try:

@@ -1,4 +1,4 @@
-"""Compute lengths of vectors. The results are equal on every CPU, to the last bit.
+"""Compute lengths of vectors with equal results on every CPU, to the last bit.
 
 numpy's norms call OpenBLAS, which rounds differently on different CPUs. Random numbers and simulations must not depend
 on the CPU.

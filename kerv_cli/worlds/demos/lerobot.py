@@ -224,7 +224,7 @@ class Source:
 
 
 class Limits:
-    """Counts what the images of each file take in memory, and refuses a file that takes too much for its size."""
+    """Counts the memory that each file's images take. Refuses a file whose images take too much for the file's size."""
 
     def __init__(self) -> None:
         self.taken: dict[Path, int] = {}
@@ -473,7 +473,7 @@ def _episode(
         file: The data file of the episode.
         names: The names of the tasks by `task_index`.
         tail: Number of copies of the last action to append to the labels.
-        taken: What the images of the earlier episodes took.
+        taken: Counts the memory that the images of each file take, earlier episodes included.
 
     Raises:
         CheckpointError: Rows are missing, a file is damaged or too large, or a number is not finite.
@@ -574,7 +574,7 @@ def _below(folder: Path, name: str) -> Path:
     """Return the path `name` below a folder.
 
     Raises:
-        CheckpointError: It leads out of the folder.
+        CheckpointError: The path leads out of the folder.
     """
     if Path(name).is_absolute() or ".." in Path(name).parts:
         raise CheckpointError(f"{folder} names a file outside its own folder, '{name[:80]}': it is not read")
@@ -697,7 +697,7 @@ def _video_frames(path: Path, start: float, rate: float, count: int, size: tuple
         start: First time, in seconds.
         rate: Frames per second.
         count: Number of frames.
-        size: Their (width, height).
+        size: (width, height) of the frames.
 
     Raises:
         KervError: The package av is not installed.
