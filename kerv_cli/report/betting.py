@@ -50,8 +50,8 @@ def wealth(values: np.ndarray, bound: float, delta: float) -> np.ndarray:
     Args:
         values: (n,) in [0, 1], in the order in which they came.
         bound: The hypothesis is a mean of at least `bound`, in (0, 1).
-        delta: Error probability δ for which the bets are optimised. The wealth may still be compared with 1/δ of
-            another δ.
+        delta: Error probability δ for which the bets are optimised. A test at another level δ′ may use the same wealth:
+            it rejects if the wealth reaches 1/δ′.
     """
     return np.exp(np.cumsum(np.log1p(bets(values, bound, delta) * (bound - values))))
 

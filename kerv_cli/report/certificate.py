@@ -1,8 +1,8 @@
 """Issue a certificate of success from a study's paired episodes.
 
 The certificate states how much success a setting loses at most against AR (docs/methods.md §4.6, ours). AR is the
-study's baseline. The other settings are the candidates. A policy is tested only once, on seeds that no other study
-ran. A further test must be asked for and gets a smaller error probability.
+study's baseline. The other settings are the candidates. The seeds must be new: no other study ran the policy on them.
+A policy is tested once. Only `again=true` allows a further test, with a smaller error probability.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ def folder_of(resolved: ResolvedStudy) -> Path:
     """Check that a study can give a certificate. Return the folder to write the certificate into.
 
     Raises:
-        UsageError: The study has only a baseline, a condition of `_check_conditions` is not met, its seeds are not
-            selection seeds, or the folder belongs to a policy that kerv ships.
+        UsageError: The study has only a baseline, or a certificate does not apply to the study. Or its seeds are
+            outside the range reserved for selection, or the folder belongs to a policy that kerv ships.
     """
     candidates = _candidates(resolved)
     if not candidates:
@@ -73,8 +73,8 @@ def folder_of(resolved: ResolvedStudy) -> Path:
 def _check_conditions(resolved: ResolvedStudy) -> None:
     """Refuse studies to which a certificate does not apply.
 
-    Candidates may differ only in the settings `prefill_draft` and `skip`. The baseline must be AR, with the same
-    tasks, seeds, policy, number format and world. The world must have no stress and wait for the policy.
+    Candidates may differ only in the settings `prefill_draft` and `skip`. The baseline must be AR. All settings must
+    have the same tasks, seeds, policy, number format and world, without stress. The world must wait during decodes.
 
     Raises:
         UsageError: A condition is not met.
@@ -103,7 +103,7 @@ def _check_conditions(resolved: ResolvedStudy) -> None:
 def planned_certificate(
     resolved: ResolvedStudy, store: Study, wanted: Sequence[Episode], settings: CalibrateSuccessSettings
 ) -> Certificate:
-    """Return the certificate of a test that has not run: it says what will be tested, in which order and how.
+    """Return the certificate before its test has run. It says what will be tested, in which order and how.
 
     Args:
         resolved: The study.
@@ -112,7 +112,7 @@ def planned_certificate(
         settings: Settings of the test.
 
     Raises:
-        UsageError: The policy was tested before and `again` is not set, or its seeds were used before.
+        UsageError: The policy was tested before and `settings.again` is not set, or its seeds were used before.
         CheckpointError: An artifact of a candidate is missing or damaged.
     """
     tested = _candidates(resolved)

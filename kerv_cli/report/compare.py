@@ -32,13 +32,13 @@ _PROVENANCE = ("host", "device_name", "git_commit", "torch_version", "mujoco_ver
 
 @dataclass(frozen=True)
 class ComparedRun:
-    """One of the two things compared: a setting of a run with episodes, or a training.
+    """One side of a comparison: a training, or one setting of a run that has episodes.
 
     Attributes:
         name: Name to print.
         run: The run.
         label: Label of the setting in the run. Empty for a training.
-        data: Episodes of the run. None until `pairs_to_compare` reads them, and for a training.
+        data: Episodes of the run. None before `pairs_to_compare` has read them. Always None for a training.
     """
 
     name: str
@@ -54,7 +54,7 @@ class ComparedRun:
 
 
 def compared_runs(database: Database, name: str) -> list[ComparedRun]:
-    """Find what a name on the command line stands for.
+    """Return the settings, or the training, that a name on the command line stands for.
 
     Args:
         database: The database.
@@ -117,8 +117,8 @@ def compare(first: ComparedRun, second: ComparedRun) -> Row:
 
         - `first` and `second`: the two names
         - `settings`: every key whose values differ, with both values. A value is None if that side lacks the key.
-        - `results`: for each measure both values, the change, and its 95 % interval if there is one
-        - `note`: why there is no ratio of times. Empty if there is one.
+        - `results`: for each measure both values, the change, and the change's 95 % interval if it is known
+        - `note`: why there is no ratio of times. Empty if there is a ratio.
 
     Raises:
         UsageError: A setting has no episodes.
@@ -182,7 +182,9 @@ def _interval(change: Estimate, what: str) -> Row:
 
 
 def same_tokens(first: Study, second: Study) -> tuple[int, int]:
-    """Return how many of the shared episodes have equal tokens, and how many episodes the two studies share.
+    """Return two counts: shared episodes with equal tokens, and all shared episodes.
+
+    An episode is shared if both studies have one with its label, task, seed and repeat.
 
     Raises:
         UsageError: A study has no episode.

@@ -58,7 +58,7 @@ def export(run: RunEntry, database: Database, to: str, folder: Path) -> list[Pat
 
 
 def _episodes(store: Study) -> pd.DataFrame:
-    """Return the table of a study's episodes that `Study.frame` makes. Raise UsageError if there are none."""
+    """Return the table `Study.frame` of a study's episodes. Raise UsageError if the study has no episodes."""
     frame = store.frame()
     if frame.empty:
         raise UsageError(f"study '{store.name}' has no episode yet: {store.how_to_run()}")
@@ -111,7 +111,7 @@ def _decodes(store: Study, episodes: pd.DataFrame, columns: Sequence[str]) -> It
 
 
 def _prompt(store: Study, settings: Mapping[str, Any]) -> int | None:
-    """Return the number of prompt tokens of a setting's policy. None if it is not known here."""
+    """Return the number of prompt tokens of a setting's policy. None if the policy's files cannot be read here."""
     name = settings.get("policy", {}).get("target") or ""
     try:
         return prompt_tokens(read_mapping(find_target(str(store.database.results), name) / "target.json"))
@@ -120,11 +120,11 @@ def _prompt(store: Study, settings: Mapping[str, Any]) -> int | None:
 
 
 def _line(row: Mapping[str, Any], levels: int) -> dict[str, Any]:
-    """Return a decode's line of a trace, without what its episode says.
+    """Return a decode as one line of a trace, without the keys that all decodes of its episode share.
 
     Args:
         row: Columns _TRACED of the decode.
-        levels: Levels of a drafted tree, for episodes from before rounds had levels.
+        levels: Levels of a drafted tree. Used for episodes of older versions of kerv, whose rounds have no levels.
     """
     seconds = {phase: row[f"seconds.{phase}"] for phase in READ_PHASES if row[f"seconds.{phase}"] is not None}
     rounds = []

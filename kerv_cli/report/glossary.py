@@ -38,7 +38,7 @@ UNVERIFIED = "executed tokens that the policy neither wrote nor accepted"
 
 
 def explained(label: str, method: str = "") -> str:
-    """Return what the name of a setting means. Empty if no word of it is known.
+    """Return what the name of a setting means. Empty if the glossary has no word of the name.
 
     Args:
         label: The setting's label, such as `spec_vla chain`.
@@ -68,5 +68,5 @@ def explanations(settings: Iterable[tuple[str, str]]) -> dict[str, str]:
 
 
 def with_code(text: str) -> Markup:
-    """Return a text as HTML. What it has in backticks becomes <code>. Templates use this function as a filter."""
+    """Return a text as HTML. Words in backticks become <code> elements. Templates use this function as a filter."""
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))

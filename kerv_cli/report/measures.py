@@ -42,11 +42,11 @@ def measure(
     Args:
         episodes: One row per episode. Columns: those of rows.EPISODE_SCHEMA, `label`, `decode_seconds`, `difficulty`,
             `run`, `block`, and those of `COMPARABLE`.
-        pairs: The episodes' pairs with those of the baseline, from `paired`.
+        pairs: Pairs of these episodes with the baseline's episodes, from `paired`.
         by: Columns that form the groups: the label, or task and label.
         averaging: MACRO computes a measure for every difficulty group and returns the unweighted mean of the groups.
             Any other value pools all episodes. Paired counts, McNemar's p and `pairs_to_settle` are always pooled.
-        all_pairs: Whether speedups also use pairs that were not measured in one block.
+        all_pairs: Whether speedups also use pairs that were not measured in one block (side by side in one process).
 
     Returns:
         The measures by group.
@@ -104,7 +104,7 @@ def compared(counts: stats.PairedCounts, difference: Estimate) -> dict[str, Any]
 
 
 def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame:
-    """Pair the episodes of settings with those of their baselines.
+    """Pair each setting's episodes with the episodes of its baseline.
 
     Two episodes form a pair if they have the same task, seed, repeat, initial state, device, number format and number
     of threads. Episodes that were run by a foreign policy server name no device; they pair with episodes of any device.
@@ -231,6 +231,6 @@ def _means(episodes: pd.DataFrame, by: list[str]) -> pd.DataFrame:
 def registered_columns() -> Mapping[str, ColumnPart]:
     """Return the table columns that plugins add, by name.
 
-    The function of each computes the column's value from the episodes of a setting.
+    `ColumnPart.built` computes the column's value from the episodes of a setting.
     """
     return ColumnPart.every()

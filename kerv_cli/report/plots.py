@@ -105,7 +105,7 @@ def with_lines(rows: pd.DataFrame, axis: str) -> pd.DataFrame:
 
 
 def _points(rows: pd.DataFrame, column: str) -> pd.DataFrame:
-    """Return the fields of a chart's points that show one column of the table. Success is in per cent."""
+    """Return the points of a chart that shows one column of the table. Success is in per cent."""
     scale = 1.0 if column == SPEED else 100.0
     ends = {"value": "", "low": "_low", "high": "_high"}
     values = {name: scale * rows[f"{column}{end}"].astype(float) for name, end in ends.items()}
@@ -168,10 +168,10 @@ def lines_figure(measures: Iterable[pd.DataFrame], xlabel: str, ylabel: str | No
     """Draw panels side by side with one legend. A line has the same colour in every panel.
 
     Args:
-        measures: Points, from `_points`. Those with the same `panel` are drawn together. A point without x is drawn as
-            a line across the panel.
+        measures: Tables of points, from `_points`. Points with the same `panel` share a panel. A point without x is
+            drawn as a line across the panel.
         xlabel: Title of the x axis.
-        ylabel: Title of the y axis. None: the panels' titles say enough.
+        ylabel: Title of the y axis. None: the y axis has no title.
     """
     points = pd.concat(measures)
     names = points["line"].unique()
@@ -200,8 +200,8 @@ def lines_figure(measures: Iterable[pd.DataFrame], xlabel: str, ylabel: str | No
 def latency_figure(results: Sequence[Result], latencies: pd.DataFrame) -> alt.ConcatChart:
     """Draw success against decoding latency, with one panel per kind of delay compensation.
 
-    Only settings whose world goes on during a decode are drawn. The x axis has the latency of the AR baseline under the
-    same clock. So methods that ran under the same clock have the same x.
+    Only settings whose world goes on during a decode are drawn. The x of a setting is the latency of the AR baseline
+    under the same clock. So all methods that ran under one clock have the same x.
 
     Args:
         results: The study's rows over all tasks.
@@ -221,12 +221,12 @@ def latency_figure(results: Sequence[Result], latencies: pd.DataFrame) -> alt.Co
 def acceptance_figure(tallies: Mapping[str, Tally], references: Mapping[str, str]) -> alt.ConcatChart:
     """Draw how many draft tokens were accepted, in three panels with a line per setting.
 
-    The first two show the share of accepted tokens among those whose predecessors were accepted, by position in the
-    draft and by DoF. The third shows the share of drafts by their number of accepted tokens.
+    The first two panels show the share of accepted tokens, by position in the draft and by DoF. They count only tokens
+    whose predecessors in the draft were all accepted. The third shows the share of drafts by number of accepted tokens.
 
     Args:
         tallies: Counts by the setting's label.
-        references: For each label, the label that it is compared with.
+        references: For each setting's label, the label of the setting that it is compared with.
     """
     frames = []
     for label, tally in tallies.items():

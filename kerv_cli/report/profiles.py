@@ -26,7 +26,8 @@ class NamedProfile:
     Attributes:
         name: The name by which the user chose it (`on=NAME`).
         profile: Seconds of each operation of a decode.
-        bounds: What bounds the encoder, the prefill and one further token. Empty if the costs were measured.
+        bounds: What takes most of the time of `encode`, `prefill` and `verify` (one further token), such as `reading`.
+            Empty if the costs were measured.
     """
 
     name: str
@@ -40,17 +41,17 @@ class NamedProfile:
 
     @property
     def title(self) -> str:
-        """Target, device and, of computed costs, the engine. Ends in "projected" if the costs were not measured."""
+        """Target and device. If the costs were computed, not measured, the engine and "projected" follow."""
         about = self.profile.about
         names = [str(about[key]) for key in ("target", "device_name", "engine") if about.get(key)]
         return ", ".join(names or [self.name]) + (", projected" if self.is_projected else "")
 
     @property
     def encoders(self) -> dict[str, Profile]:
-        """The same costs with a faster or slower encoder, by the keys of `ENCODERS`.
+        """The profile with other times of the vision encoder, by the keys of `ENCODERS`.
 
-        The engine's system time is added to the encoder's time. Empty if the encoder's floor is unknown: the shortest
-        time that the device's bandwidth and arithmetic allow.
+        The engine's system time is added to each time. The floor is the shortest time that the device's bandwidth and
+        arithmetic allow. Empty if the profile does not have the encoder's floor.
         """
         about, phases = self.profile.about, self.profile.phases
         floor, system = about.get("encoder_floor"), float(about.get("encoder_system", 0.0))
@@ -108,7 +109,7 @@ def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfil
 
 
 def _known(folders: Iterable[Path]) -> str:
-    """Return the clause of a message that names the profiles in some folders. Empty if they have none."""
+    """Return the clause of a message that names the profiles in some folders. Empty if the folders have none."""
     names: set[str] = set()
     for folder in folders:
         names.update(path.name.removesuffix(_SHIPPED) for path in folder.glob(f"*{_SHIPPED}"))

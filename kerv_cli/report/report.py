@@ -70,7 +70,7 @@ def to_report(database: Database, study: str | None) -> list[Study]:
 
 @dataclass(frozen=True)
 class Report:
-    """A report on one study: what it says, and the files that have it. Charts and verdict are computed once.
+    """A report on one study: its verdict, charts and written files. Verdict and charts are computed once.
 
     Attributes:
         data: The study with its tables.
@@ -91,7 +91,10 @@ class Report:
 
     @property
     def command_to_settle(self) -> str:
-        """The command with which the verdict would name a setting. Empty if more episodes would not help."""
+        """The command that runs enough episodes for the verdict to name a setting.
+
+        Empty if the verdict names one already, if more episodes would not help, or if the study is not a sweep.
+        """
         study, episodes = self.data.study, self.verdict.episodes
         return study.sweep_command(f"episodes={episodes}") if study.kind == SWEEP and episodes else ""
 
@@ -156,7 +159,8 @@ def write_study(data: StudyData, loss: float, profiles: Sequence[NamedProfile] =
     Args:
         data: The study with all its episodes.
         loss: Largest loss of success, in points, that the verdict accepts.
-        profiles: The machines on which its speeds are estimated. Empty: those that the study names, and its own.
+        profiles: Cost profiles of the machines for which speeds are estimated. Empty: the profiles that the study's
+            file names, and measured profiles of the machine that ran the study.
         publish: Write tables and plots into the results folder itself instead of its report/.
 
     Raises:
@@ -208,7 +212,7 @@ class Unpublishable(KervError):
 
 
 def refusals(results: Sequence[Result]) -> list[str]:
-    """Return the reasons why a study may not be published, as clauses of an error message. Empty if it may.
+    """Return the reasons why a study may not be published, as clauses of an error message. Empty: it may be published.
 
     Args:
         results: The study's rows over all tasks.
@@ -313,7 +317,10 @@ def _cell(row: Result) -> str:
 
 
 def _settings(data: StudyData) -> list[dict[str, Any]]:
-    """Return every setting's label, overrides, and the values in which it differs from the one it is compared with."""
+    """Return for every setting its label, its overrides, its reference, and the values that differ between the two.
+
+    The reference is the label of the setting that it is compared with.
+    """
     flat = {label: flatten(without(one.settings, NOT_DETERMINING)) for label, one in data.settings.items()}
     settings = []
     for label, own in flat.items():
@@ -326,7 +333,7 @@ def _settings(data: StudyData) -> list[dict[str, Any]]:
 def _films(data: StudyData) -> list[dict[str, Any]]:
     """Return for each method a film of its first recorded success and one of its first recorded failure.
 
-    If no episode with an outcome was filmed, there is no film of it. Without Rerun there is no film. A film is a
+    A method without a recording of such an episode lacks that film. Without Rerun there are no films. A film is a
     dictionary with the setting's label, the task, the seed, the outcome, the number of steps and the GIF in base64.
     """
     if not has_rerun():

@@ -39,7 +39,8 @@ class Priced:
         result: The setting's row as measured, pooled over tasks.
         machine: The cost profile of the other machine.
         measures: The measures of `result`, estimated for the machine.
-        encoders: Estimated speeds per episode with another encoder, by `ENCODERS`. Empty for measured profiles.
+        encoders: Estimated speeds per episode with other times of the vision encoder, by the keys of `ENCODERS`. Empty
+            for measured profiles.
     """
 
     result: Result
@@ -106,22 +107,22 @@ def repriced(data: StudyData, profiles: Sequence[NamedProfile], lenient: bool = 
 
 
 def _estimated(data: StudyData, works: Mapping[str, _LabelWork], profile: Profile) -> dict[Hashable, Measures]:
-    """Return the measures of every setting, by its label, if its decodes took what the profile says."""
+    """Return the measures of every setting, by its label, with the times of its decodes computed from a profile."""
     episodes = data.episodes
     priced = pd.concat([_priced(episodes[episodes["label"] == label], work, profile) for label, work in works.items()])
     return measure(priced, paired(priced, data.references), all_pairs=True)
 
 
 def own_prices(data: StudyData) -> list[Priced]:
-    """Return the study's speeds, estimated for the machines that its file names.
+    """Return the study's speeds, estimated for the machines that the study's file names.
 
-    If the study's own machine was benchmarked, the estimates for it follow.
+    If `kerv bench` has measured the machine that ran the study, the estimates for that machine follow.
     """
     return prices_on(data, dict.fromkeys((*data.study.machines, *own_profiles(data))))
 
 
 def prices_on(data: StudyData, names: Iterable[str]) -> list[Priced]:
-    """Return the estimates of `repriced` for several machines.
+    """Return the estimates of `repriced` for several machines. Empty without usable profiles or times.
 
     Args:
         data: The study's episodes.
@@ -137,9 +138,9 @@ def prices_on(data: StudyData, names: Iterable[str]) -> list[Priced]:
 
 
 def own_profiles(data: StudyData) -> list[str]:
-    """Return the names of the profiles that `kerv bench` measured of the study's targets on the study's machines.
+    """Return the names of the cost profiles of the study's targets that were measured on the study's own machines.
 
-    Estimates from these profiles, beside the measured times, show how far the cost model is from the truth.
+    Comparing estimates from these profiles with the measured times shows how accurate the cost model is.
     """
     devices, names = set(data.episodes["device_name"]), []
     for one in data.settings.values():
@@ -199,16 +200,16 @@ def _work_of_label(data: StudyData, label: str) -> _LabelWork:
 
 
 def levels_of(settings: Mapping[str, Any]) -> int:
-    """Return the number of levels of the trees that a setting drafts. 0: it drafts chains.
+    """Return the number of levels of the trees that a setting drafts. 0: the setting drafts chains.
 
-    This is needed for episodes of older versions of kerv, whose rounds do not have this number.
+    This is needed for episodes of older versions of kerv, whose stored rounds do not have this number.
     """
     proposer = settings.get("proposer", {})
     return int(proposer["depth"]) if proposer.get("shape") == "tree" else 0
 
 
 def _priced(episodes: pd.DataFrame, work: _LabelWork, profile: Profile) -> pd.DataFrame:
-    """Return the episodes with other times: those that their decodes would take at the profile's costs.
+    """Return the episodes with the times that their decodes would take at the profile's costs.
 
     The columns `seconds` (of all decodes) and `decode_seconds` (of each decode) are replaced.
     """
@@ -222,8 +223,8 @@ def _priced(episodes: pd.DataFrame, work: _LabelWork, profile: Profile) -> pd.Da
 def repriced_summary(priced: Sequence[Priced]) -> pd.DataFrame:
     """Return a table of speeds to print: one row per setting.
 
-    Two columns hold the speeds as measured. Two more columns per machine hold the estimated ones. For a computed
-    profile, a third one holds the speeds with another encoder, see `ENCODERS`.
+    Two columns hold the measured speeds. Two more columns per machine hold the estimated speeds. If the machine's
+    profile was computed, a third column holds the speeds with other times of the vision encoder, see `ENCODERS`.
     """
     rows: dict[str, dict[str, str]] = {}
     for row in priced:

@@ -37,11 +37,11 @@ class Measures:
         time_per_episode_ms: Inference time per episode.
         phases: Time per control step in milliseconds, by phase of a decode. Keys begin with `ms.`.
         steps_to_success: Mean number of control steps of the episodes that succeeded.
-        path_m: Mean path of the end effector in the episodes that succeeded, metres.
+        path_m: Mean length of the end effector's path in the episodes that succeeded, metres.
         jerk: Mean of the episodes' root mean square jerk of the end effector, m/s³.
         near_contact_failure: Share of the failures in which the hand came near the object.
         latency_p50_ms: Median time of a decode.
-        latency_p95_ms: Time that the slowest 5 % of the decodes take at least.
+        latency_p95_ms: 95th percentile of the time of a decode.
         latency_worst_ms: Time of the slowest decode.
         AL: Acceptance length, tokens per verification.
         accepted_per_round: Accepted draft tokens per verification.
@@ -49,11 +49,11 @@ class Measures:
         forwards_per_step: Target forwards per control step.
         skip_rate: Share of decodes whose draft was executed without verification.
         unverified_share: Share of executed tokens that the target did not verify.
-        compensation_rate: Share of decodes with compensated tokens.
+        compensation_rate: Share of decodes in which a prediction, not the target, filled in tokens.
         retrieval_share: Share of decodes in which retrieval drafted.
-        deviation: Mean distance of the executed actions from those of AR.
+        deviation: Mean absolute difference between the executed actions and AR's, in normalised units.
         felt_latency_ms: Mean time that the world went on during a decode.
-        felt_latency_steps: The same in control steps.
+        felt_latency_steps: Mean number of control steps that the world went on during a decode.
         held_share: Share of control steps that repeated the last action, because no newer one had arrived.
         added: Values of the columns that plugins add, by name.
         counts: Outcomes of the pairs with the baseline.
@@ -127,13 +127,13 @@ class Measures:
 class Result:
     """One row of a study's table: a setting, over all tasks or on one task.
 
-    Several different values are joined by semicolons.
+    If episodes differ in the value of a text field, semicolons join the values.
 
     Attributes:
         study: Name of the study.
         averaging: MICRO if all episodes are pooled, MACRO if difficulty groups are averaged, or ONE_TASK.
         label: Label of the setting.
-        series: Name that the settings along the study's axis share.
+        series: Name shared by all settings that differ only in the value on the study's axis.
         unstressed: Label of the same setting without stress.
         method: The setting's decoding method.
         task: Names of the tasks.
@@ -203,8 +203,8 @@ class Result:
 def columns_of(values: Mapping[str, Any]) -> Row:
     """Return the fields of a row as the columns of a table.
 
-    An `Estimate` becomes three columns: its name, and with the endings _low and _high its interval. `PairedCounts`
-    become their number `pairs` and one column per outcome. A mapping becomes one column per key.
+    An `Estimate` NAME becomes three columns: NAME, and NAME_low and NAME_high for the interval. `PairedCounts` become
+    the column `pairs` (number of pairs) and one column per outcome. A mapping becomes one column per key.
 
     Args:
         values: Fields by name, such as `vars(result)`.
@@ -230,7 +230,7 @@ def frame_of(results: Iterable[Result]) -> pd.DataFrame:
 
 
 def averaged(results: Iterable[Result], averaging: str = MICRO) -> list[Result]:
-    """Return the rows that pool all episodes (MICRO), or those that average over difficulty groups (MACRO)."""
+    """Return the rows that pool all episodes (MICRO), or the rows that average over difficulty groups (MACRO)."""
     return [row for row in results if row.averaging == averaging]
 
 

@@ -77,7 +77,7 @@ def mean_of(groups: Sequence[Estimate]) -> Estimate:
     (method of variance estimates recovery: Zou and Donner, Statistics in Medicine 27, 2008).
 
     Args:
-        groups: One estimate per group; NaN: no estimate. All must have the same confidence; the result has it, too.
+        groups: One estimate per group. NaN: the group has none. All intervals, the result's too, have one confidence.
 
     Returns:
         The mean of the known estimates with its interval. All three numbers are NaN if there are none.
@@ -129,11 +129,12 @@ def difference(first: Estimate, second: Estimate) -> Estimate:
 
     With Wilson intervals this is Newcombe's hybrid score interval (Statistics in Medicine 17, 1998, page 873, method
     10). The distance from the difference to its lower end is the root of the sum of two squared distances: from the
-    second rate to its lower end, and from the first rate to its upper end. For the upper end it is the other way round.
+    second rate to its lower end, and from the first rate to its upper end. For the upper end of the difference, the
+    distances are to the second rate's upper end and to the first rate's lower end.
 
     Args:
         first: A rate with its interval.
-        second: The other rate, with an interval of the same confidence. The result has it, too.
+        second: The other rate. Both intervals and the result's have the same confidence.
     """
     value = second.value - first.value
     low = value - math.hypot(second.value - second.low, first.high - first.value)
@@ -264,8 +265,8 @@ def over_runs(estimates: Sequence[Estimate], same_pairs: bool) -> Estimate:
     """Combine the speedups that several runs measured.
 
     The value is the geometric mean of the k speedups. Its 95 % interval is computed for the logarithm, by Student's t
-    with k − 1 degrees of freedom. If all runs have the same pairs, their spread does not show how much the choice of
-    pairs matters. Then the mean half width of the intervals over pairs is added in squares.
+    with k − 1 degrees of freedom. If all runs have the same pairs, the spread of the runs does not show how much the
+    choice of pairs matters. Then the half width is √(a² + b²): a from Student's t, b the mean of the runs' half widths.
 
     Args:
         estimates: The speedup in each run, with the interval over its pairs.
@@ -287,11 +288,11 @@ def _spread(effects: np.ndarray, strata: np.ndarray, clusters: np.ndarray) -> fl
     A pair is a baseline episode and a method episode from the same initial state. Pairs in different clusters are
     independent. The variance is estimated within each stratum, from the spread of its clusters' sums of `effects`. Then
     the variances of the strata are added. Strata with only one cluster are merged into one stratum (Cochran, Sampling
-    Techniques, section 5A.12). The half width is the standard deviation times the 97.5 % quantile of Student's t, with
-    as many degrees of freedom as there are more clusters than strata.
+    Techniques, section 5A.12). The half width is the standard deviation times the 97.5 % quantile of Student's t. Its
+    degrees of freedom are the number of clusters minus the number of strata.
 
     Args:
-        effects: (n,) how far each pair moves that logarithm, to first order; 0 in total.
+        effects: (n,) effect of each pair on the logarithm of the speedup, to first order. The sum is 0.
         strata: (n,) number of each pair's stratum (task), from 0.
         clusters: (n,) number of each pair's cluster (block), from 0. A cluster is in one stratum.
 

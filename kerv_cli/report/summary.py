@@ -56,8 +56,8 @@ def interval(estimate: Estimate, form: str = ".2f", unit: str = "", scale: float
 
     Args:
         estimate: The estimate.
-        form: Format of the numbers. Even with `.0f` the value gets one decimal unless that is 0, because a success of
-            99.5 % must not read as 100 %.
+        form: Format of the numbers. With `.0f` the value still gets one decimal, unless that decimal is 0. So a success
+            of 99.5 % does not read as 100 %.
         unit: Text after the value.
         scale: Factor for value and interval; 100 for per cent.
         between: Text between the two ends of the interval.
@@ -113,11 +113,11 @@ def cells_of(row: Result) -> dict[str, str]:
 
 
 def summary_frame(results: Sequence[Result], averaging: str = MICRO) -> pd.DataFrame:
-    """Return the rows of a study's table as text, with the main columns and those that are not all empty or zero.
+    """Return a study's table as text: the main columns, and every other column with a value that is not 0 or empty.
 
     Args:
         results: The study's rows over all tasks.
-        averaging: Take the rows that pool all tasks (MICRO) or that average over difficulty groups (MACRO).
+        averaging: MICRO takes the rows that pool all tasks. MACRO takes the rows that average over difficulty groups.
     """
     frame = pd.DataFrame(map(cells_of, averaged(results, averaging)))
     is_used = ~frame.isin([MISSING, "0 %", ""]).all() | frame.columns.isin(frame.columns[:MAIN])
@@ -131,7 +131,7 @@ class SummaryTable:
     Attributes:
         results: The study's rows over all tasks.
         all: Print every column. If they do not fit side by side, they are printed in several parts.
-        how: What to type to see every column. Empty: do not say it.
+        how: What to type to see every column. Empty: the table does not mention hidden columns.
     """
 
     results: Sequence[Result]

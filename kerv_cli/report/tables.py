@@ -62,11 +62,11 @@ class StudyData:
         study: The settings, and the episodes that the study asks for.
         episodes: One row per stored episode (label, task, seed and repeat). Columns: those of `Study.frame`, and
             difficulty, device, number format and threads.
-        runs: One table like `episodes` for each of at least three runs (commands) with the same code on the same
-            machine. Each run measured all episodes of the study, or all settings and tasks on seeds of its own. Empty
-            if there are no such runs.
+        runs: One table like `episodes` per run (command). All runs used the same code on the same machine. Each run
+            measured all episodes of the study, or else all settings and tasks on its own seeds. Empty if there are
+            fewer than three such runs.
         same_pairs: Whether each run measured all episodes of the study.
-        against: Suffix of the tables' names, such as `_against_ar`, if they compare with another baseline than the
+        against: Suffix of the tables' names, such as `_against_ar`, if the user chose another baseline than the
             study's own. Else empty.
     """
 
@@ -136,9 +136,9 @@ class StudyData:
 
     @functools.cached_property
     def by_speed(self) -> list[tuple[str, stats.Estimate]]:
-        """The timed settings, the fastest per episode first, each with its speed per episode against the next.
+        """The timed settings, the fastest per episode first, each with its speed per episode against the next slower.
 
-        Empty if the settings run under several conditions, or if fewer than two were timed.
+        The slowest has NaN. Empty if the settings are compared with several baselines, or if fewer than two were timed.
         """
         timed = [row for row in averaged(self.results) if is_number(row.speed)]
         order = values_of(sorted(timed, key=attrgetter("speed"), reverse=True), "label")
@@ -224,8 +224,8 @@ def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyDa
     """Read a study and its stored episodes.
 
     Args:
-        study: The study, named or loaded.
-        wanted: Episodes of a loaded study to read. Settings without any of them are left out. None: read all episodes.
+        study: The study. Its name is enough if `wanted` is None.
+        wanted: Episodes to read. Settings without any of them are left out. None: read all episodes.
 
     Raises:
         UsageError: There is no such study, or none of its episodes is stored.
@@ -247,7 +247,7 @@ def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyDa
 
 
 def _same_state(run: pd.DataFrame, episodes: pd.DataFrame) -> bool:
-    """Return whether the same code on the same machine computed a run as the episodes of the study."""
+    """Return whether a run and the study's episodes were computed by the same code on the same machine."""
     # imported episodes may lack some columns
     return all(set(run[name]) == set(episodes[name]) for name in _ONE_STATE if name in episodes)
 
@@ -421,7 +421,7 @@ def _joined(values: Iterable[object]) -> str:
 
 
 def split_values(texts: Iterable[object]) -> set[str]:
-    """Return all different values in texts that may hold several, separated by semicolons."""
+    """Split texts at semicolons and return all different values."""
     return set(";".join(map(str, texts)).split(";"))
 
 
@@ -478,8 +478,8 @@ def summed_table(results: Iterable[Result]) -> pd.DataFrame:
 
     Returns:
         One row for each method and each way of pooling. `method` is the setting's label without stress. `sum` says what
-        was pooled, such as `push`, `level 2` or `all`. `label` consists of both. The other columns are the same as in a
-        study's table.
+        was pooled, such as `push`, `level 2` or `all`. `label` joins `method` and `sum`. The other columns are the same
+        as in a study's table.
     """
     rows = [row for row in averaged(results) if row.stress != NO_STRESS]
     reference = next((row.unstressed for row in rows if row.is_baseline), "")
@@ -516,8 +516,8 @@ _LATENCY_COLUMNS = (
 def latency_table(results: Iterable[Result]) -> pd.DataFrame:
     """Return the rows of settings whose world goes on during a decode (`rollout.clock=real`).
 
-    A row is left out if the world of its baseline waits. The added column `ar_latency_ms` is the mean latency of the
-    baseline's decodes.
+    A row is left out if the world of its baseline waits during decodes. The added column `ar_latency_ms` is the mean
+    latency of the baseline's decodes.
     """
     rows = averaged(results)
     latencies = {row.label: row.measures.felt_latency_ms for row in rows}

@@ -21,10 +21,10 @@ class Tally:
     """Counts over the verifications of some decodes.
 
     Attributes:
-        nodes: Number of verified draft tokens, those beside the accepted path included.
+        nodes: Number of verified draft tokens. In a tree, tokens that are not on the accepted path count, too.
         lengths: Entry k: number of verifications that accepted k draft tokens.
-        judged: Entry k: number of verifications whose judged path has k tokens: the accepted ones and, if the draft
-            was rejected after them, the rejected one.
+        judged: Entry k: number of verifications that judged k draft tokens. The judged tokens are the accepted ones
+            and, if a token was rejected after them, that token.
         reached: (D,) number of reached tokens of each DoF.
         accepted: (D,) number of accepted tokens of each DoF.
     """
@@ -40,8 +40,8 @@ class Tally:
         """Count n verifications.
 
         Args:
-            start: (n,) number of tokens committed before each.
-            judged: (n,) length of the judged path.
+            start: (n,) number of tokens committed before each verification.
+            judged: (n,) number of judged tokens: the accepted tokens and the first rejected one, if any.
             accepted: (n,) number of accepted draft tokens.
             nodes: (n,) number of verified draft tokens.
             dofs: Number of DoFs D.
@@ -71,7 +71,7 @@ class Tally:
 
     @property
     def by_position(self) -> tuple[np.ndarray, np.ndarray]:
-        """Number of reached and of accepted tokens at each position in the draft, the first position first."""
+        """Two arrays: the number of reached and of accepted tokens at each position in the draft, in order."""
         reached, accepted = (counts[::-1].cumsum()[::-1][1:] for counts in (self.judged, self.lengths))
         return reached, _sum(np.zeros(len(reached), int), accepted)
 
@@ -96,7 +96,7 @@ class Tally:
 
 
 def rates(reached: np.ndarray, accepted: np.ndarray) -> list[float | None]:
-    """Return accepted ÷ reached at each position. None for a position that no draft reached."""
+    """Return accepted ÷ reached tokens at each position. None at positions that no draft reached."""
     quotients: list[float | None] = (accepted / np.maximum(reached, 1)).tolist()
     for position in np.flatnonzero(reached == 0):
         quotients[position] = None

@@ -32,6 +32,8 @@ POINTS = 100.0
 class Choice:
     """Which setting to take, for one task or for all tasks together.
 
+    The bound is the largest loss of success that the reader accepts.
+
     Attributes:
         where: The task, or `all tasks`.
         pairs: Number of pairs of the setting with the most pairs. A pair is one episode of the baseline and one of the
@@ -41,7 +43,7 @@ class Choice:
         chosen: Fastest setting that is shown to lose less success than the bound. Empty if there is none.
         loss_at_most: Upper bound on the chosen setting's loss of success, in points, at 95 % confidence. NaN if no
             setting is chosen.
-        candidate: Fastest setting that more pairs would show to lose less than the bound, if the rates stay the same.
+        candidate: Fastest setting that is not chosen yet, but would be after more pairs if the rates stay the same.
             Empty if there is none, or if a setting is chosen.
         candidate_pairs: About how many pairs in all the candidate needs. NaN without a candidate.
         tested: Number of settings that are tested for their loss of success: those that are faster than the baseline or
@@ -300,10 +302,12 @@ def sentence(choice: Choice, loss: float, baseline: str) -> str:
 
 
 def order_of(by_speed: Sequence[tuple[str, stats.Estimate]]) -> str:
-    """Return the settings in the order of their speed per episode, and which neighbours cannot be told apart.
+    """Return the settings as text in the order of their speed per episode, joined by `>`.
+
+    `≈` joins neighbours whose episodes cannot show which is faster. The text explains this sign.
 
     Args:
-        by_speed: The settings, the fastest first, each with its speed against the next.
+        by_speed: The settings, the fastest first, each with its speed against the next slower one.
     """
     text = ""
     for label, speed in by_speed[:-1]:
@@ -313,7 +317,7 @@ def order_of(by_speed: Sequence[tuple[str, stats.Estimate]]) -> str:
 
 
 def unsolved(baseline: str, success: float) -> str:
-    """Return the sentence that a baseline succeeds too rarely, so that no setting is recommended.
+    """Return the sentence for a baseline that succeeds too rarely. It says that no setting is recommended.
 
     Args:
         baseline: Label of the baseline.
@@ -355,7 +359,7 @@ def _factor(choice: Choice) -> str:
 def _missing(choice: Choice) -> str:
     """Return the clause that says about how many more pairs would show that a setting is good enough to be chosen.
 
-    It names that setting. If more pairs would not help, it says so.
+    The clause names that setting. If more pairs would not help, the clause says so.
     """
     if not choice.candidate:
         return "at these rates, more pairs would not show one either"

@@ -58,7 +58,7 @@ class _Log:
         self.hz = hz
 
     def static(self, path: str, archetype: rr.AsComponents) -> None:
-        """Log data that holds for the whole episode. `path` is its name in the viewer."""
+        """Log data that holds for the whole episode. `path` is the name of the data in the viewer."""
         self.recording.log(path, archetype, static=True)
 
     def rows(self, path: str, steps: Steps, columns: Iterable[rr.ComponentColumn]) -> None:
@@ -102,7 +102,7 @@ class _Log:
             steps: Control step of each row.
             names: Name of each line.
             values: For each row, one number per line. A row that is empty or begins with None is left out.
-            colors: Colour of each line (0xRRGGBBAA). Repeated if there are more lines.
+            colors: Colour of each line (0xRRGGBBAA). The colours repeat if there are more lines than colours.
         """
         present, numbers = [], []
         for step, row in zip(steps, values, strict=True):

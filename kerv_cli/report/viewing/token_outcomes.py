@@ -51,10 +51,11 @@ class TokenOutcome:
 
     Attributes:
         kind: A key of OUTCOMES.
-        token: The committed token. None if no token was committed there.
-        draft: The drafted token. None if nothing was drafted there.
-        target: The target's token. None if the target did not decode it.
-        limit: Acceptance threshold r of the token's DoF, in bins. None if there was none.
+        token: The committed token. None if no token was committed at this position.
+        draft: The drafted token. None if no token was drafted at this position.
+        target: The target's token. None if the target decoded no token at this position.
+        limit: Acceptance threshold r of the token's DoF, in bins. None if the token was not drafted, or if the
+            acceptance rule has no threshold.
     """
 
     kind: str
@@ -142,7 +143,7 @@ def _unjudged(decode: DecodeRecord) -> str:
 
 
 def acceptance(decodes: Iterable[DecodeRecord]) -> tuple[float, ...]:
-    """Return the acceptance length and the accepted drafts per verification (docs/methods.md §7).
+    """Return the acceptance length and the accepted draft tokens per verification (docs/methods.md §7).
 
     Returns:
         Mean number of committed tokens, and mean number of accepted draft tokens, per verification. Empty if the

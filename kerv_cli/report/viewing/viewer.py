@@ -87,7 +87,7 @@ def open_recording(paths: Sequence[Path]) -> str:
 
 
 def _own_name(path: Path) -> str:
-    """Return a file name that recordings of other runs do not have: the run's name goes before the recording's."""
+    """Return a file name that no recording of another run has: the run's name, then the recording's name."""
     return f"{path.parent.parent.name}-{path.name}" if path.parent.name == "rollouts" else path.name
 
 
