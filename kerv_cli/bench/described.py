@@ -1,4 +1,7 @@
-"""Find the shape of a policy from a number of weights, a Hugging Face `config.json` or a target of kerv. No torch."""
+"""Find the shape of a policy from a number of weights, a Hugging Face `config.json` or a target of kerv.
+
+This module needs no torch.
+"""
 
 from __future__ import annotations
 
@@ -45,10 +48,10 @@ class Described:
     """What the cost of a policy's decodes depends on.
 
     Attributes:
-        shape: Its shape. None if it emits no action tokens.
+        shape: Shape of the policy. None if the policy emits no action tokens.
         tokens: N, tokens of a chunk.
         assumed: Assumptions about the policy, one phrase each.
-        encoder: Seconds of its vision encoder. None: not given, so they are computed from the shape.
+        encoder: Seconds of the vision encoder, if the user states them. None: they are computed from the shape.
     """
 
     shape: Shape | None

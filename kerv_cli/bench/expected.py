@@ -1,7 +1,7 @@
 """Compute what a decode costs on average, from a profile and from how often draft tokens are accepted.
 
-`engine.cost` gives the costs: a decode is a prefill, then rounds of a draft and a verification. How a method
-drafts is given, or read from a published table. Nothing is run, and this module needs no torch.
+A decode is a prefill, then rounds of a draft and a verification. `engine.cost` gives their costs. The caller says how a
+method drafts, or it is read from a published table. Nothing is run, and this module needs no torch.
 """
 
 from __future__ import annotations
@@ -28,12 +28,13 @@ class Drafts:
     """How a method drafts, and how much of it runs unverified.
 
     Attributes:
-        depth: Largest number of tokens in a drafted chain, or of levels in a tree. 0: no drafter drafts.
+        depth: Largest number of tokens in a drafted chain, or of levels in a tree. 0: the method uses no drafter.
         nodes: Largest number of nodes of a drafted tree. 0: the drafter drafts chains.
-        source: Kind of cost of a draft that is made once per decode, such as `early`. Empty: there is none.
-        in_prefill: Whether the prefill verifies the source's draft.
+        source: What drafts once per decode instead of the drafter or in addition to it: `early`, `scout` or
+            `retrieval`. Empty: nothing does.
+        in_prefill: Whether the prefill verifies the draft of `source`.
         retrieved: Share of the verified decodes in which `source` drafts, not the drafter.
-        skipped: Share of the decodes that execute the source's draft unverified.
+        skipped: Share of the decodes that execute the draft of `source` unverified.
         encodes: Whether an unverified draft needs the target's encoder.
     """
 
@@ -62,11 +63,11 @@ class Means(NamedTuple):
     verifications: float = 0.0
 
     def mixed(self, other: Means, share: float) -> Means:
-        """Return the weighted mean of both: `other` happens with the probability `share`, else this."""
+        """Return the mean of two cases: `other` has the probability `share`, and these means have 1 − `share`."""
         return Means(*((1 - share) * x + share * y for x, y in zip(self, other, strict=True)))
 
     def plus(self, other: Means) -> Means:
-        """Return the means of both in sequence: each number is the sum of this one's and the other's."""
+        """Return the sums of these means and `other`: the means of two parts of a decode that follow one another."""
         return Means(*map(operator.add, self, other))
 
     @property
@@ -90,7 +91,7 @@ class Decodes:
     drafts: Drafts
 
     def seconds(self, acceptance: Sequence[float]) -> float:
-        """Return the mean seconds of all decodes, verified or not.
+        """Return the mean seconds of a decode. Unverified decodes count with their share `drafts.skipped`.
 
         Args:
             acceptance: Probability that the first, second, … token of a draft is accepted; see `verified`.
@@ -110,7 +111,7 @@ class Decodes:
         return self.profile.decode(self.tokens) / self.seconds(acceptance)
 
     def verified(self, acceptance: Sequence[float]) -> Means:
-        """Return the means of a decode that the target verifies.
+        """Return the expected seconds, forwards, accepted tokens and verifications of one verified decode.
 
         Args:
             acceptance: Probability that the first, second, … token of a draft is accepted, if all tokens before it
@@ -125,18 +126,20 @@ class Decodes:
         return first.plus(prefill)
 
     def acceptance_for(self, forwards: float) -> float:
-        """Return the least probability of acceptance with which a verified decode takes at most `forwards` forwards.
+        """Return the smallest acceptance probability at which a verified decode takes `forwards` forwards or fewer.
+
+        Every draft token is accepted with this probability. 1 if no smaller one is enough.
 
         Args:
-            forwards: Mean number of forwards of the target's trunk.
+            forwards: Mean number of forwards of the target's trunk per decode.
         """
         return _least(lambda chance: self.verified([chance]).forwards <= forwards)
 
     def break_even(self) -> Means | None:
         """Return the mean costs and counts of a verified decode that takes as long as an autoregressive one.
 
-        They are computed at the acceptance probability at which both take the same time. Returns None if the verified
-        decode is slower even at probability 1.
+        At one acceptance probability of the draft tokens, both decodes take the same time. The means are computed at
+        this probability. None if the verified decode is slower even at probability 1.
         """
         limit = self.profile.decode(self.tokens)
         if self.verified([1.0]).seconds > limit:
@@ -145,7 +148,7 @@ class Decodes:
 
     @functools.cached_property
     def _cost(self) -> Callable[[str, int], float]:
-        """`Profile.seconds`, whose results are kept, because a search asks for the same ones many times."""
+        """`Profile.seconds` with a cache, because a search asks for the same costs many times."""
         return functools.cache(self.profile.seconds)
 
     @property
@@ -153,7 +156,7 @@ class Decodes:
         return self._cost(self.drafts.source, 1) if self.drafts.source else 0.0
 
     def _round(self, start: int, acceptance: Sequence[float], after: Sequence[Means]) -> Means:
-        """Return the means of a decode from the round on that begins after `start` tokens."""
+        """Return the means of the rest of a decode, which begins with a round after `start` committed tokens."""
         drafts, most = self.drafts, self.tokens - start - 1
         if drafts.retrieved == 1:
             return self._forward("verify", 1 + most, most, start, acceptance, after)
@@ -171,7 +174,7 @@ class Decodes:
     def _forward(
         self, kind: str, rows: int, depth: int, start: int, acceptance: Sequence[float], after: Sequence[Means]
     ) -> Means:
-        """Return the means of a decode from a forward on that verifies paths of `depth` draft tokens."""
+        """Return the means of the rest of a decode, which begins with a forward that verifies `depth` draft tokens."""
         prompt, reached, feeds = self.profile.prompt * (start == 0), 1.0, self.drafts.depth > 0
         seconds, forwards, taken, verifications = self._cost(kind, rows), 1.0, 0.0, float(depth > 0)
         for accepted in range(depth + 1):
@@ -189,7 +192,10 @@ class Decodes:
 
 
 def _least(enough: Callable[[float], bool]) -> float:
-    """Return the smallest probability that is enough, if every larger one is enough, too. 1 if none is."""
+    """Return the smallest probability for which `enough` is true. 1 if there is none.
+
+    If `enough` is true for a probability, it must be true for all larger ones.
+    """
     if enough(0.0):
         return 0.0
     low, high = 0.0, 1.0
@@ -215,7 +221,7 @@ class Recorded:
         label: Label of the setting.
         method: Name of its method.
         tokens: N, number of tokens in a chunk.
-        drafts: How it drafted.
+        drafts: How the setting drafted.
         forwards: Forwards of the trunk per verified decode.
         speed: Measured speed against AR, per control step.
     """
@@ -235,9 +241,10 @@ def nearest_table(tokens: int) -> str:
 
 
 def recorded(table: str) -> list[Recorded]:
-    """Return the settings of a published table that decode token by token or with drafts, AR first.
+    """Return the settings of a published table, AR first.
 
-    A wheel without the table gives none.
+    Settings that emit all tokens of a chunk in one pass (`parallel`) are left out. Empty if the installed package does
+    not contain the table.
 
     Args:
         table: One of TABLES.

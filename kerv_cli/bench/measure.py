@@ -60,8 +60,8 @@ class Phase:
 
     Attributes:
         kind: encode, prefill, verify, feed (the drafter reads the target's hidden states), draft (the drafter drafts a
-            chain), tree (the drafter drafts a tree), or early, retrieval, scout (drafting with that source). The last
-            three are measured with the shipped policy, because their time does not depend on the target's size.
+            chain), tree (the drafter drafts a tree), or early, retrieval, scout (drafts made without the drafter). The
+            last three are measured with the shipped policy, because their time does not depend on the target's size.
         rows: Number of tokens in a forward or in a drafted chain. Depth of a drafted tree. 1 for the other kinds.
         seconds: Median of all repeats.
         p95: 95th percentile of all repeats.
@@ -231,9 +231,9 @@ def profile_of(phases: Sequence[Phase], tokens: int) -> Profile:
 
 @torch.inference_mode()
 def needs_of_draft(decoder: Any) -> tuple[float, float]:
-    """Return the bytes that the network of a decoder's prefill draft reads, and its number of arithmetic operations.
+    """Return the bytes and the number of arithmetic operations that one prefill draft needs.
 
-    Both are 0 if no network makes the draft.
+    These are the bytes and operations of the network that makes the draft. Both are 0 if no network makes it.
     """
     draft, target = decoder.parts.prefill_draft, decoder.target
     if not isinstance(draft, EarlyProposer):
@@ -248,7 +248,7 @@ def needs_of_draft(decoder: Any) -> tuple[float, float]:
 
 
 def source_methods() -> dict[str, str]:
-    """Return the method that measures each kind of draft: {"early": "early_unverified", …}."""
+    """Return for each kind of draft the method with which its time is measured: {"early": "early_unverified", …}."""
     return {part.cost: part.measured_by for part in ProposerPart.every().values() if part.measured_by}
 
 
@@ -278,8 +278,8 @@ def card_of(model: Model, machine: Machine) -> dict[str, Any]:
         machine: The device's measured bandwidth and operations per second.
 
     Returns:
-        By name: the model's sizes, the device's bandwidth and operations per second, and the floors. `card_rows` prints
-        them.
+        A dictionary of the model's sizes, the device's bandwidth and operations per second, and the floors. `card_rows`
+        makes a table of it.
     """
     prompt, tokens, sizes = model.target.max_prompt, model.size, model.sizes
     needs = {

@@ -89,7 +89,7 @@ def random_target(shape: TargetSettings, device: torch.device, dtype: torch.dtyp
     are rounded to half precision, as the shipped ones are.
 
     Args:
-        shape: Shapes of the target.
+        shape: Settings of the target: its width, layers and so on.
         device: Device of the weights.
         dtype: Number format of the weights.
     """
@@ -179,7 +179,7 @@ def blank(target: Any) -> Observation:
 
 
 def memory_of(device: torch.device) -> float:
-    """Return the bytes of free memory of a GPU, or for a CPU the bytes of memory of this machine."""
+    """Return the bytes of memory that a device has: for a GPU the free memory, for a CPU all memory of the machine."""
     if device.type == "cuda":
         return float(torch.cuda.mem_get_info(device)[0])
     return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))

@@ -96,7 +96,10 @@ class Engine:
     source: str
 
     def times(self, needs: Needs, device: Device) -> dict[str, float]:
-        """Return the seconds of reading, arithmetic and launches, of which the longest counts, and of system time."""
+        """Return the seconds of reading, arithmetic, launches and system time.
+
+        A phase takes the longest of the first three times, plus the system time.
+        """
         kernels = needs.layers * self.layer + needs.blocks * self.block + needs.kernels
         return {
             "reading": needs.read / device.bandwidth / self.share,

@@ -30,11 +30,12 @@ class Family:
 
     Attributes:
         name: Name in the table.
-        method: The method that stands for it, see `conf/method`.
-        drafts: How the methods draft at best: they retrieve or skip in every decode in which they may.
+        method: Method of `conf/method` that represents the family.
+        drafts: How the methods draft in the fastest case: every decode that may retrieve its draft does, and every
+            decode that may skip verification does.
         length: Published mean number of tokens committed per verification, for chunks of seven tokens. None: not
             published.
-        reported: Speed against AR that the paper reports, on its own machine. Empty: none.
+        reported: Speed against AR that the paper reports for its own machine. Empty: the paper reports none.
     """
 
     name: str
@@ -60,7 +61,7 @@ _PUBLISHED_TOKENS = 7
 
 
 def computed(policy: Described, device: Device) -> list[NamedProfile]:
-    """Return the costs of a policy on a device with each engine, named after the engine."""
+    """Return the costs of a policy on a device: one profile for each engine, with the engine's name."""
     shape, encoder, costs = policy.shape, policy.encoder, []
     assert shape is not None
     for engine in ENGINES.values():
@@ -82,12 +83,12 @@ class Answer:
 
     Attributes:
         family: The family.
-        ceiling: Speed if every draft token is accepted, and every decode that may go unverified does.
-        published: Speed at the acceptance that the paper reports. None: it reports none.
-        own: Speed at the acceptance that kerv measured. None: no published table of kerv has this family.
-        recorded: The setting of a published table from which that acceptance comes.
-        break_even: Accepted draft tokens per verification at which the family is as fast as AR. None: it never is, or
-            it verifies nothing.
+        ceiling: Speed if every draft token is accepted, and every decode that may skip verification does.
+        published: Speed at the acceptance that the paper reports. None: the paper reports no acceptance.
+        own: Speed at the acceptance that kerv measured. None: the published table of kerv does not have this family.
+        recorded: The setting of that table with which the acceptance of `own` was measured. None if `own` is None.
+        break_even: Accepted draft tokens per verification at which the family is as fast as AR. None: the family is
+            always slower, or it skips verification.
     """
 
     family: Family
@@ -100,10 +101,10 @@ class Answer:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What speculation can give a policy with an engine.
+    """How fast speculative decoding can make a policy that runs on an engine.
 
     Attributes:
-        costs: What its decodes cost.
+        costs: Seconds of each operation of the policy's decodes.
         tokens: N, tokens of a chunk.
     """
 
@@ -117,7 +118,7 @@ class Estimate:
 
     @cached_property
     def parts(self) -> dict[str, tuple[float, str]]:
-        """Seconds of each part of an autoregressive decode, and what bounds them, by the part's name."""
+        """By name of each part of an autoregressive decode: its seconds, and what takes most of them."""
         profile, bounds = self.costs.profile, self.costs.bounds
         rest = self.tokens - 1
         seconds = {
@@ -158,9 +159,10 @@ class Estimate:
 
 
 def closest(table: Iterable[Recorded], family: Family) -> Recorded | None:
-    """Return the setting of a table that represents a family. None if the table does not have its method.
+    """Return the setting of a table that represents a family. None if no setting has the family's method.
 
-    Of several settings, the first with the family's form of draft (chain or tree) is taken, else the first of all.
+    If several settings have the method, return the first that drafts as the family does (chain or tree). If none of
+    them does, return the first.
     """
     found = None
     for one in table:

@@ -69,7 +69,7 @@ def projection_rows(computed: Iterable[Projection]) -> list[Row]:
 
 
 def anchor_rows() -> list[Row]:
-    """Return a row per published time of OpenVLA-7B, beside ours."""
+    """Return a row per published time of OpenVLA-7B, with the time that kerv computes."""
     rows = []
     for one in ANCHORS:
         row = {"device": DEVICES[one.device].title, "engine": one.engine.name}
@@ -127,7 +127,7 @@ def _numbers(answers: Iterable[Answer], name: str, none: str = "–") -> str:
 
 
 def _beside(texts: Sequence[str]) -> str:
-    """Return cells side by side, or one if all are equal."""
+    """Return the texts as one cell, side by side. If all are equal, the cell has the text once."""
     return texts[0] if len(set(texts)) == 1 else " / ".join(texts)
 
 

@@ -38,7 +38,9 @@ CANNOT = (
 
 @dataclass(frozen=True)
 class TracedRound:
-    """A forward of the target, and the draft that it verified. The defaults are one token without a draft.
+    """A forward of the target, and the draft that it verified.
+
+    The default values describe a forward without a draft that commits one token.
 
     Attributes:
         start: Number of tokens committed before this forward. 0: it reads the prompt.
@@ -121,7 +123,7 @@ class TracedDecode:
         """Check that there is a round.
 
         Raises:
-            CheckpointError: There is none.
+            CheckpointError: There is no round.
         """
         if not self.rounds:
             raise CheckpointError("rounds: a decode has one at least")
@@ -234,11 +236,11 @@ def _resampled(
 
     Args:
         episodes: Number of episodes.
-        speeds_of: Numbers of episodes -> speeds.
+        speeds_of: Function that takes the numbers of the drawn episodes and returns the speeds.
 
     Returns:
-        The speeds with their 95 % intervals, and the share of the draws whose fastest one is the fastest of all
-        episodes, too. Intervals and share are NaN if there is one episode.
+        The speeds over all episodes, with their 95 % intervals. And the share of the draws in which the same speed is
+        the highest as over all episodes. Intervals and share are NaN if there is only one episode.
     """
     speeds, same = speeds_of(np.arange(episodes)), np.nan
     low = high = [np.nan] * len(speeds)
@@ -288,10 +290,12 @@ def _speeds(plans: Sequence[Decodes], tried: np.ndarray, accepted: np.ndarray, c
 
 
 def _counts(decodes: Sequence[TracedDecode]) -> tuple[np.ndarray, np.ndarray]:
-    """Count, for every episode and every position in a drafted chain, how often it was tried and accepted.
+    """Count how often a draft token was tried, and how often accepted, by episode and position in the drafted chain.
+
+    A token is tried if all tokens before it in its chain were accepted.
 
     Returns:
-        Two arrays (episodes, longest chain). Empty if there is no chain.
+        Two arrays (episodes, longest chain): tried and accepted tokens. Empty if there is no chain.
     """
     chains = []
     for episode, decode in zip(_numbers(decodes), decodes, strict=True):
