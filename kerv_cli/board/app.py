@@ -65,7 +65,7 @@ class Impatient(H11Protocol):
         self.loop.call_later(PATIENCE, self._check, None)
 
     def _check(self, before: object) -> None:
-        """Close the connection if it waits and asked for nothing since the last check. `before`: the request then."""
+        """Close a waiting connection that has sent no request since the last check, when its request was `before`."""
         waits = self.cycle is None or self.cycle.response_complete
         if waits and self.cycle is before:
             self.transport.close()

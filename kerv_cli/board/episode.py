@@ -128,8 +128,8 @@ def show_film(request: Request) -> Response:
 async def record(request: Request) -> Response:
     """Start to record an episode, unless it is being recorded already.
 
-    This thread starts the process, because it lives as long as the board. Threads that make pages end, and the kernel
-    ends a process with the thread that started it (`end_with`).
+    The recording process is started in this function's thread, which lives as long as the board. Threads that make
+    pages end earlier, and the kernel ends a process when the thread that started it ends (`end_with`).
     """
     found = await run_in_threadpool(_found, request)
     if found.store.kind == IMPORT:
@@ -177,7 +177,8 @@ _VIEWER_CONTENT = (
 def viewer_files() -> dict[str, tuple[bytes, str]]:
     """Return content and media type of each file of Rerun's web viewer, by the file's name.
 
-    Rerun's package offers them only through a web server of its own. It is started for a moment, for this machine only.
+    Rerun's package offers these files only through its own web server. The server is started for a moment, and only
+    this machine can reach it.
 
     Raises:
         KervError: The server does not start.

@@ -177,8 +177,8 @@ def _asked(request: Request) -> tuple[list[Cell], dict[str, Any]]:
     """Read a study's episodes for a page.
 
     Returns:
-        The episodes, only of the setting and task that the address names, if it names any. And values that the
-        templates of both pages show: `study`, `baseline`, `known` (all settings and tasks) and `chosen`.
+        The episodes. If the address names a setting or a task, only its episodes. And values that the templates of both
+        pages show: `study`, `baseline`, `known` (all settings and tasks) and `chosen`.
 
     Raises:
         UnknownName: The study has no such setting or task.

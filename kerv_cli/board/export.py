@@ -40,7 +40,7 @@ def export_board(database: Database, names: Collection[str], folder: Path) -> li
 
     Args:
         database: The database.
-        names: Ids of the runs to export. Empty: all of them.
+        names: Ids of the runs to export. Empty: all runs.
         folder: An empty folder.
 
     Raises:
@@ -62,7 +62,7 @@ def export_board(database: Database, names: Collection[str], folder: Path) -> li
 
 
 def file_of(address: str) -> str:
-    """Return the name of the file for an address of the board. Empty if it is not exported."""
+    """Return the name of the file for an address of the board. Empty if the page at the address is not exported."""
     path = unquote(urlsplit(address).path).strip("/")
     film = re.fullmatch(r"(episodes/\d+)/(?:frames/\d+|film\.gif)", path)
     if film:
@@ -97,9 +97,9 @@ def _asked(app: Starlette, address: str) -> Response:
 
 
 def _collected(app: Starlette) -> dict[str, str | bytes]:
-    """Ask for the first page and for all that it leads to. Return the answers by address, without those that fail.
+    """Ask for the first page and for all pages and files that it leads to. Return the answers by address.
 
-    Parts of a page that a browser loads later (`hx-trigger="load"`) are put into it.
+    Failed answers are left out. Parts that a browser loads later (`hx-trigger="load"`) are put into their page.
     """
     pages: dict[str, str | bytes] = {}
     waiting, films, episodes = ["/"], 0, 0
@@ -153,11 +153,11 @@ def _links(address: str, text: str) -> list[str]:
 
 
 class _Static(HTMLParser):
-    """Rewrites a page of the board for the file system.
+    """Rewrites a page of the board so that it works as a file, without the board.
 
     Args:
         address: The page's address.
-        pages: Addresses of all that is exported.
+        pages: Addresses of all exported pages and files.
     """
 
     def __init__(self, address: str, pages: Collection[str]) -> None:
@@ -168,7 +168,7 @@ class _Static(HTMLParser):
         self.unlinked: list[bool] = []  # whether each open link has become text
 
     def rewritten(self, text: str) -> str:
-        """Return the page for the file system."""
+        """Return the page as it is written to its file."""
         self.feed(text)
         self.close()
         return "".join(self.parts)

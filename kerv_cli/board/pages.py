@@ -56,9 +56,10 @@ def database_of(request: Request) -> Database:
 
 
 def refreshed(page: Callable[[Request, str, bool], Response]) -> Callable[[Request], Response]:
-    """Decorate a page that asks for itself again and again. It is made only if the database has changed since.
+    """Decorate the function of a page that the browser reloads again and again.
 
-    The page is also given the database's version, and whether any command runs.
+    The page is made only if the database has changed since the last time. The function also gets the database's
+    version, and whether any command is running.
     """
 
     @functools.wraps(page)
@@ -88,7 +89,7 @@ def inside(request: Request, path: Path) -> Path:
     """Resolve the symbolic links of a path, which must be in the results folder.
 
     Raises:
-        HTTPException: There is no such file, or it is outside.
+        HTTPException: There is no such file, or the file is outside the results folder.
     """
     resolved = path.resolve()
     if not resolved.is_relative_to(database_of(request).results.resolve()) or not resolved.exists():

@@ -58,7 +58,7 @@ class Recorder:
     def record(self, found: FoundEpisode) -> None:
         """Start to record an episode, unless it is being recorded already.
 
-        Call it in a thread that lives as long as the board: the recording process ends with it.
+        Call this method in a thread that lives as long as the board. The recording process ends with that thread.
         """
         path = found.recording
         with self._lock:

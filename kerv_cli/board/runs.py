@@ -36,7 +36,7 @@ ORDERS: dict[str, Callable[[RunEntry], object]] = {
 
 @refreshed
 def show_runs(request: Request, version: str, is_live: bool) -> Response:
-    """Show studies, artifacts and unfinished commands. Unless the user sorts them, running ones come first."""
+    """Show studies, artifacts and unfinished commands. What is running comes first, unless the user sorts the page."""
     asked = {name: request.query_params.get(name, "") for name in ("kind", "state", "text", "sort")}
     only = request.app.state.only
     every = [run for run in find_runs(database_of(request)) if not only or run.id in only]

@@ -34,7 +34,8 @@ def _parts(database: Database, name: str, version: str, is_running: bool) -> tup
         database: The database.
         name: Name of the study.
         version: `Study.version` of the study. A study is read again only if its version has changed.
-        is_running: Whether it runs. If so, no cost model estimates its speeds, which would take time from it.
+        is_running: Whether the study is running. Then a cost model does not estimate its speeds, because that would
+            slow the study down.
     """
     from kerv_cli.report.report import Report, study_parts  # imports Altair, which takes a second
     from kerv_cli.report.reprice import own_profiles, prices_on
