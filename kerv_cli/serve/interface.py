@@ -44,7 +44,7 @@ class Interface:
         images_alone: Whether the policy reads images of any size and no state. A message may then leave out the state.
         gripper: How the gripper's value (0 closed to 1 open) is sent: `as_is`, `signed` (-1 closed, 1 open) or
             `signed_inverted` (1 closed, -1 open).
-        grip: The environment's action values that close and that open the gripper. Empty if unknown.
+        grip: Two values of the gripper in the environment's actions: closing, then opening. Empty if unknown.
     """
 
     actions: ActionSpace
@@ -92,7 +92,7 @@ class Interface:
             message: The whole message, for the error message.
 
         Raises:
-            UsageError: There are no numbers, too few or too many, or they are not finite.
+            UsageError: The numbers are missing, too few, too many or not finite.
         """
         few, many = len(self.observation.proprioception), self.observation.state
         if not many or (values is None and self.images_alone):

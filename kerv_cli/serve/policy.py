@@ -106,7 +106,7 @@ class Policy:
         return StateRange(low, high, names, self.settings.margin)
 
     def _by_task(self) -> list[ArtifactPart]:
-        """Return those kinds of the method's artifacts that contain numbers or data by task."""
+        """Return the kinds of the method's artifacts that contain numbers or data for each task."""
         parts = [ArtifactPart.find(kind) for kind in sorted(self.method.needs)]
         return [part for part in parts if part.by_task]
 

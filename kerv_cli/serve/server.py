@@ -64,7 +64,8 @@ class PolicyServer:
     def listening(self, host: str, port: int) -> Iterator[int]:
         """Serve clients until the end of the block. Yield the port.
 
-        All threads are daemons. No client can delay the end by more than LAST_ANSWERS, even during its handshake.
+        All threads are daemons. No client can delay the end by more than LAST_ANSWERS seconds, even during its
+        handshake.
 
         Args:
             host: Address to listen on.
