@@ -239,8 +239,8 @@ def _resampled(
         speeds_of: Function that takes the numbers of the drawn episodes and returns the speeds.
 
     Returns:
-        The speeds over all episodes, with their 95 % intervals. And the share of the draws in which the same speed is
-        the highest as over all episodes. Intervals and share are NaN if there is only one episode.
+        The speeds over all episodes, with their 95 % intervals. And the share of the draws in which the fastest choice
+        is the same as over all episodes. Intervals and share are NaN if there is only one episode.
     """
     speeds, same = speeds_of(np.arange(episodes)), np.nan
     low = high = [np.nan] * len(speeds)

@@ -32,7 +32,7 @@ HOST = "127.0.0.1"
 _HOSTS = [HOST, "localhost"]
 _READS = ("GET", "HEAD")
 PATIENCE = 5.0
-"""Seconds between two checks of a connection. It is closed if it sent no request since the last check."""
+"""Seconds between two checks of a connection. A connection without a request since the last check is closed."""
 LAST_ANSWERS = 1.0
 """Seconds for which a stopping board waits for answers that are being computed."""
 

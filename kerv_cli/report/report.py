@@ -47,7 +47,7 @@ from kerv_cli.report.viewing.film import animation, film_of
 LOSS = 3.0
 """Default for the largest loss of success that the page's verdict accepts, in points."""
 _FRAMES = 240
-"""Films play at half speed. One with more than half this number of frames plays faster, to stay short and small."""
+"""Films play at half speed. A film with more than half this number of frames plays faster, to stay short and small."""
 
 
 def to_report(database: Database, study: str | None) -> list[Study]:
