@@ -27,6 +27,7 @@ from kerv_cli.methods.kerv import CompensateSettings, KinematicThresholdSettings
 from kerv_cli.methods.sp_vla import SpeedSkipSettings
 from kerv_cli.methods.spec_vla import FixedThresholdSettings, RelaxedAcceptanceSettings
 from kerv_cli.targets.checkpoint import load_target
+from kerv_cli.worlds.metaworld.spec import SPEC
 
 METHODS = groups()["method"]
 AR: dict[str, Any] = {
@@ -79,7 +80,7 @@ def test_a_preset_is_the_parts_that_its_name_promises(method):
     if method in PRESETS:
         assert asked.parts() == {**AR, **PRESETS[method]}
     assert (asked.chunk, asked.datastore) == (0, NoSettings("exact"))
-    Method.of(asked).check(SimpleNamespace(chunk=4, parallel=method == "parallel"))
+    Method.of(asked).check(SimpleNamespace(chunk=4, actions=SPEC.actions, parallel=method == "parallel"))
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -116,7 +117,7 @@ def test_settings_survive_a_file(method):
 )
 def test_what_does_not_belong_together_is_refused(overrides, says):
     with refused(says):
-        Method.of(composed(*overrides.split())).check(SimpleNamespace(chunk=4))
+        Method.of(composed(*overrides.split())).check(SimpleNamespace(chunk=4, actions=SPEC.actions))
 
 
 def test_only_what_needs_no_states_can_be_chosen_before_the_prefill():
@@ -128,7 +129,7 @@ def test_only_what_needs_no_states_can_be_chosen_before_the_prefill():
     # a part from elsewhere can still be named in settings that Hydra did not compose
     method = {**AR, "prefill_draft": heisd.HybridProposerSettings()}
     with pytest.raises(UsageError, match="prefill_draft=hybrid: it reads the target's states"):
-        Method(method).check(SimpleNamespace(chunk=4))
+        Method(method).check(SimpleNamespace(chunk=4, actions=SPEC.actions))
 
 
 @pytest.mark.parametrize(

@@ -320,7 +320,7 @@ def check_init(settings: TargetSettings, camera: str, description: TargetDescrip
 
 
 def continued_target(
-    settings: TargetSettings, init: CompactTarget, camera: str, code: FastCode | None
+    settings: TargetSettings, init: CompactTarget, camera: str, code: FastCode | None = None
 ) -> CompactTarget:
     """Make a target that starts from the weights, action statistics and words of another target.
 
