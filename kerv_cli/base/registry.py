@@ -261,7 +261,7 @@ class AcceptancePart(Part):
 
 @dataclass(frozen=True, kw_only=True)
 class ThresholdPart(Part):
-    """A threshold, which chooses the acceptance radius.
+    """A registered threshold: the rule that chooses the acceptance radius r of each decode.
 
     Args:
         batchable: Whether the part works for several episodes at once.

@@ -136,10 +136,10 @@ class Decodes:
         return _least(lambda chance: self.verified([chance]).forwards <= forwards)
 
     def break_even(self) -> Means | None:
-        """Return the mean costs and counts of a verified decode that takes as long as an autoregressive one.
+        """Find the acceptance probability of draft tokens at which a verified decode takes as long as AR.
 
-        At one acceptance probability of the draft tokens, both decodes take the same time. The means are computed at
-        this probability. None if the verified decode is slower even at probability 1.
+        Returns:
+            The verified decode's mean costs and counts at this probability. None if it is slower even at probability 1.
         """
         limit = self.profile.decode(self.tokens)
         if self.verified([1.0]).seconds > limit:

@@ -102,7 +102,7 @@ class Decoder(ActionDecoder):
 
     @cached_property
     def autoregressive(self) -> Decoder:
-        """An autoregressive decoder of the same target, which `decode` uses to measure the deviation."""
+        """An autoregressive decoder of the same target. `decode` compares its actions with this decoder's."""
         return Decoder(self.target, chunk=self.steps)
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:

@@ -65,7 +65,7 @@ class StreakSkip(Skip):
         return cls(settings, draft.sources[0] if isinstance(draft, MergedProposer) else draft)
 
     def begin(self, task: str, seed: int) -> None:
-        """Begin an episode: allow `opening` decodes without verification."""
+        """Begin an episode. Its first decodes may go unverified, as many as the setting `opening` says."""
         self.allowed = self.left = self.settings.opening
 
     def take(self, chunk: Chunk) -> SkipDecision:

@@ -38,7 +38,7 @@ UNVERIFIED = "executed tokens that the policy neither wrote nor accepted"
 
 
 def explained(label: str, method: str = "") -> str:
-    """Return what the name of a setting means. Empty if the glossary has no word of the name.
+    """Explain the label of a setting, word by word. Empty if none of its words is in the glossary.
 
     Args:
         label: The setting's label, such as `spec_vla chain`.

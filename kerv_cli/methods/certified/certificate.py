@@ -144,7 +144,7 @@ class Certificate:
 
     @property
     def is_tested(self) -> bool:
-        """Whether any candidate was tested."""
+        """Whether the tests had enough episodes that AR solved to judge any of the candidates."""
         return any(one.p is not None for one in self.candidates)
 
     @property

@@ -260,11 +260,10 @@ def attention(frames, out, qkv, tables, cache, start, filled, mask, keys, values
         start: Number of valid slots in the cache. The new tokens get the next T slots.
         filled: Number of slots that are already copied to `keys` and `values`.
         mask: (T, start + T or more), 0 for slots that a token sees. Shape (0, 1) means that attention is causal.
-        keys: (B · A, panels, C, PANEL) copy of the cached keys. It is stored like the weights of a linear layer with
-            the channels as inputs and the slots as outputs, in panels of PANEL outputs. So one matrix product gives the
-            scores of a query.
-        values: (B · A, panels, slots, PANEL) copy of the cached values. It is stored like the weights of a linear layer
-            with the slots as inputs and the channels as outputs. So one matrix product applies the attention weights.
+        keys: (B · A, panels, C, PANEL) copy of the cached keys in the layout of a matrix from channels to slots. One
+            matrix product with it gives the scores of a query. A panel holds PANEL slots.
+        values: (B · A, panels, slots, PANEL) copy of the cached values in the layout of a matrix from slots to
+            channels. One matrix product with it applies the attention weights. A panel holds PANEL channels.
     """
     tokens, heads, channels = tables.shape[0], cache.shape[2], tables.shape[2]
     stop, size, parts = start + tokens, 4 * frames.shape[1], values.shape[1]
