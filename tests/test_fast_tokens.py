@@ -100,6 +100,13 @@ def test_motion_accepts_what_moves_alike_and_the_actions_stay_within_the_toleran
     assert rule.judge_after([], tree, [middle, middle, middle, middle], 0) == ((0, 2), None)
     assert rule.judge_after([], tree, [far, middle, middle, middle], 0) == ((1,), None)
     assert MotionRule(SPACE, 0.0).judge_after([], tree, [near, near, far, far], 0) == ((0, 2), None)
+    # later coefficients are the target's to choose: no end in place of a zero, no token of more coefficients
+    assert rule.difference([], code.end, middle) == 0
+    assert rule.judge_after([], TokenTree.build([code.end], [-1]), [middle, middle], 0).path == ()
+    longer = next(token for token in range(2 * middle + 1, code.end) if set(code.parts[token][1:]) <= {0})
+    first = code.parts[longer][0] + middle
+    assert rule.judge_after([], TokenTree.build([longer], [-1]), [first, middle], 0).path == ()
+    assert rule.judge_after([], TokenTree.build([first], [-1]), [longer, middle], 0).path == (0,)
     # nothing is accepted after an end token
     ended = TokenTree.build([code.end, near], [-1, 0])
     assert rule.judge_after([], ended, [code.end, near, near], 0).path == (0,)

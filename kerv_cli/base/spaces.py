@@ -131,8 +131,8 @@ class ActionSpace:
 
     @cached_property
     def is_strict(self) -> np.ndarray:
-        """(D,) bool: which DoFs are strict (tokens must equal the target's). With a code of whole chunks, all are."""
-        return np.array([self.code is not None or name in self.strict for name in self.names])
+        """(D,) bool: which DoFs are strict, so that their tokens must equal the target's."""
+        return np.array([name in self.strict for name in self.names])
 
     @cached_property
     def bounds(self) -> tuple[tuple[int, int], ...]:
@@ -181,8 +181,8 @@ class ActionSpace:
             start = last
 
     def strict_tokens(self, size: int) -> np.ndarray:
-        """Return (size,) bool: whether each of a chunk's first `size` tokens belongs to a strict DoF."""
-        return np.resize(self.is_strict, size)
+        """Return (size,) bool: which of a chunk's first `size` tokens are of strict DoFs. With a code, all are."""
+        return np.resize(self.is_strict, size) if self.code is None else np.ones(size, dtype=bool)
 
     def normalise(self, actions: np.ndarray) -> np.ndarray:
         """Map actions (..., D) from environment units to [-1, 1]. Values outside are clipped."""
@@ -265,6 +265,8 @@ def action_limits(low: np.ndarray, high: np.ndarray) -> tuple[tuple[float, ...],
 
 
 def _text(value: Any) -> str:
+    if isinstance(value, FastCode):
+        return f"FAST with {len(value.merges)} merges"
     if isinstance(value, tuple):
         return ("+" if value and isinstance(value[0], Group) else ", ").join(map(_text, value)) or "none"
     if isinstance(value, Group):

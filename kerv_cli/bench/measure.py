@@ -185,7 +185,7 @@ def costs_of(
         _, prompt_states, *turns = (s for name, s in laps if name == "propose")
         yield ("feed", prompt), prompt_states
         for one, drafting in zip(rounds[1:], turns[::2], strict=False):
-            levels = min(drafter.depth, decoder.steps * decoder.target.actions.dofs - one.start - 1)
+            levels = min(drafter.depth, decoder.target.actions.longest(decoder.steps) - one.start - 1)
             yield ("tree" if drafter.top_k > 1 else "draft", levels), drafting
         for one, feeding in zip(rounds[1:], turns[1::2], strict=False):
             yield ("feed", 1 + one.accepted), feeding

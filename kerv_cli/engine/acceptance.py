@@ -128,7 +128,7 @@ class DistanceRule(Buildable):
 
     def same_limits(self, r: int, strict: bool = True) -> tuple[int, ...]:
         """Return the limit r for each of the D DoFs, in bins. With `strict`, strict DoFs (such as a gripper) get 0."""
-        return tuple(r * (not (strict and one)) for one in self.space.is_strict)
+        return tuple(r * (not (strict and one)) for one in self.space.strict_tokens(self.space.kinds))
 
     @abstractmethod
     def limits(self, r: int) -> tuple[int, ...]:

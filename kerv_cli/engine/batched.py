@@ -60,6 +60,8 @@ class BatchDecoder:
         for chunk, tokens in zip(verified, self._tokens(verified), strict=True):
             for token in chunk.until_end(tokens):
                 chunk.commit_token(token)
+        for chunk in chunks:
+            chunk.situation.last[:] = chunk.tokens
         similarity = self.decoder.parts.similarity
         return [chunk.record(chunk.actions(), math.nan, dict(UNTIMED), similarity(chunk)) for chunk in chunks]
 

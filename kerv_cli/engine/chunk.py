@@ -334,7 +334,7 @@ class Chunk:
         return DecodeRecord(
             tokens=tuple(self.tokens),
             actions=actions,
-            size=len(self.tokens) if self.space.end is not None else self.size,
+            size=self.size,
             forwards=self.forwards,
             rounds=tuple(self.rounds),
             mode=next(filter(None, (one.drafter for one in self.rounds)), "ar"),

@@ -270,7 +270,7 @@ class Decoder(ActionDecoder):
         if proposer is None or chunk.remaining < 2:
             return EMPTY
         depth = chunk.remaining - 1
-        draft = proposer.propose(chunk, depth).until(self.space.end)
+        draft = proposer.propose(chunk, depth)
         draft.check(self.space.tokens, proposer.name, depth)
         stopwatch.lap("propose")
         return draft
@@ -305,7 +305,8 @@ class Decoder(ActionDecoder):
         rule, r = self.acceptance.of_drafts_from(proposer.name), self.threshold.radius()
         path, rejected = rule.judge_after(chunk.tokens, verified.tree, verified.target_tokens, r)
         kept = chunk.until_end([verified.tree.tokens[node] for node in path])
-        return Accepted(path[: len(kept)], rejected if len(kept) == len(path) else None)
+        ended = bool(kept) and kept[-1] == self.space.end
+        return Accepted(path[: len(kept)], None if ended else rejected)
 
     def commit(self, chunk: Chunk, verified: Verified, accepted: Accepted, proposer: Proposer | None) -> Tensor:
         """Commit the accepted path and, if the chunk has room, the bonus: the target's next token.

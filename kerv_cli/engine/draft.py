@@ -50,22 +50,6 @@ class Draft:
     def __len__(self) -> int:
         return self.tokens.shape[0]
 
-    def until(self, end: int | None) -> Draft:
-        """Return the draft without the tokens that come after an end token. A draft on the GPU stays as it is.
-
-        Args:
-            end: The token that ends a chunk. None: no token ends a chunk.
-        """
-        if end is None or self.tokens.device != HOST or end not in self.tokens:
-            return self
-        tokens, parents = self.tree.tokens, self.tree.parents
-        alive: list[int] = []
-        for node, parent in enumerate(parents):
-            if parent == ROOT or (parent in alive and tokens[parent] != end):
-                alive.append(node)
-        index = {node: place for place, node in enumerate(alive)} | {ROOT: ROOT}
-        return Draft.of([tokens[node] for node in alive], [index[parents[node]] for node in alive])
-
     def check(self, vocabulary: int, proposer: str, depth: int) -> None:
         """Raise an error if the draft cannot be verified.
 

@@ -61,7 +61,7 @@ class ChainProposer(Proposer):
         from kerv_cli.engine.draft import EMPTY, Draft
 
         chains = self.chains(chunk, depth)
-        return Draft.of(chains[0]) if chains else EMPTY
+        return Draft.of(chunk.until_end(chains[0])) if chains else EMPTY
 
     @abstractmethod
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:

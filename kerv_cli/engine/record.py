@@ -109,12 +109,12 @@ class DecodeRecord:
 
     @property
     def unverified(self) -> int:
-        """Number of executed tokens that the target did not verify.
+        """Number of executed action values that the target did not verify.
 
-        In a skipped or parallel decode these are all tokens. In any other decode they are the tokens that a rectifier
-        predicted.
+        In a skipped or parallel decode these are all numbers of the actions. In any other decode they are the tokens
+        that a rectifier predicted.
         """
-        return len(self.tokens) if self.skipped or self.mode == PARALLEL else self.compensated
+        return int(self.actions.size) if self.skipped or self.mode == PARALLEL else self.compensated
 
     @property
     def verifications(self) -> int:

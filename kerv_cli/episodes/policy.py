@@ -206,6 +206,8 @@ def _profile_latency(settings: RolloutSettings, target: TargetDescription) -> La
         raise UsageError(f"rollout.profile={name}: {path} has no phase '{lacks[0]}', which this method needs")
     ar_seconds = settings.rollout.ar_ms / 1000.0
     whole = profile.decode(target.actions.longest(settings.chunk or target.chunk))
+    if ar_seconds and target.actions.code:
+        raise UsageError("rollout.ar_ms: chunks of this target differ in length; leave out rollout.ar_ms")
     if ar_seconds and not whole:
         raise UsageError(f"rollout.profile={name}: its AR decode takes no time; leave out rollout.ar_ms")
     return profiled(profile, ar_seconds / whole if ar_seconds else 1.0)

@@ -128,7 +128,7 @@ class Method:
         draft, skip = self.prefill_draft, self.skip
         threshold = registry.ThresholdPart.find(self.settings["threshold"].kind)
         is_used = draft.absent or skip.takes_draft
-        if not (self.proposer.absent and skip.batchable and is_used):
+        if not (self.proposer.absent and self.parts["boundary"].absent and skip.batchable and is_used):
             raise UsageError(
                 f"rollout.batch={batch}: method={self.name} decodes one episode at a time. Leave rollout.batch out"
             )

@@ -32,7 +32,7 @@ class JacobiProposer(ChainProposer):
 
     With strict acceptance this ends with the tokens of autoregressive decoding. If a prefill draft was rejected, the
     first guess begins with the target's tokens after the rejection. All other tokens of the first guess stand for
-    normalised actions of 0.
+    normalised actions of 0, or end the chunk if an end token can.
 
     Attributes:
         depth: Number of tokens guessed at once. 0: all remaining tokens.
@@ -53,7 +53,8 @@ class JacobiProposer(ChainProposer):
     def begin(self, chunk: Chunk) -> None:
         """Make the first guess, after the prefill."""
         tokens = chunk.rejection.target[: chunk.remaining]
-        self.guess = [*tokens, *[chunk.space.tokens // 2] * (chunk.remaining - len(tokens))]
+        filler = chunk.space.tokens // 2 if chunk.space.end is None else chunk.space.end
+        self.guess = [*tokens, *[filler] * (chunk.remaining - len(tokens))]
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         """Return the current guess as one chain of at most `depth` tokens."""

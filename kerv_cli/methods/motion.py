@@ -52,7 +52,8 @@ class MotionRule(DistanceRule):
     """Accepts a draft token if the chunk's motion is nearly the same as with the target's token.
 
     Each of the two motions is decoded from the committed tokens, the accepted draft tokens, and one of the two tokens.
-    Coefficients that are still missing count as zero. No action of the chunk may differ by more than `tolerance`.
+    Coefficients that are still missing count as zero. No action of the chunk may differ by more than `tolerance`. The
+    draft token may not decide more coefficients than the target's token, and may not end the chunk in its place.
     """
 
     tolerance: float
@@ -95,6 +96,14 @@ class MotionRule(DistanceRule):
             gap[: len(part)] += sign * np.array(part, dtype=float)
         return float(np.abs(gap @ self.basis[start:]).max(initial=0.0))
 
+    def is_close(self, before: Sequence[int], token: int, target: int) -> bool:
+        """Return whether the draft `token` may stand for the target's token after the tokens `before`."""
+        code = self.space.code
+        assert code is not None
+        if target != code.end and (token == code.end or len(code.parts[token]) > len(code.parts[target])):
+            return False
+        return self.difference(before, token, target) <= self.tolerance
+
     def judge_after(self, tokens: Sequence[int], tree: TokenTree, target_tokens: Sequence[int], r: int) -> Accepted:
         """Return the longest path of accepted draft tokens. Of equally long paths the first wins. `r` is not used."""
         paths: dict[int, list[int]] = {ROOT: list(tokens)}  # tokens of the chunk up to each accepted node
@@ -103,7 +112,7 @@ class MotionRule(DistanceRule):
             before, target = paths.get(parent), target_tokens[parent + 1]
             if before is None or self.space.end in before:
                 continue
-            if token == target or self.difference(before, token, target) <= self.tolerance:
+            if token == target or self.is_close(before, token, target):
                 paths[node] = [*before, token]
                 best = node if len(paths[node]) > len(paths[best]) else best
         return Accepted(tuple(tree.path_to(best)), nearest_child(tree, best, target_tokens))

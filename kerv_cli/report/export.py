@@ -94,7 +94,10 @@ def _to_trace(store: Study, path: Path) -> Path:
         for label, part in frame.groupby("label", sort=False):
             chosen = settings.get(str(label), {})
             size = max((len(row["tokens"]) for row in _decodes(store, part, ["tokens"])), default=0)
-            prompt, levels = _prompt(store, chosen), levels_of(chosen)
+            target = _target(store, chosen)
+            if target.get("actions", {}).get("code"):
+                raise UsageError(f"--to trace: chunks of {label} differ in length, and a trace has one length")
+            prompt, levels = prompt_tokens(target) if target else None, levels_of(chosen)
             for row in _decodes(store, part, _TRACED):
                 about = {"episode": row["episode"], "setting": label, "prompt": prompt, "tokens": size}
                 file.write(json.dumps({**about, **_line(row, levels)}) + "\n")
@@ -110,13 +113,13 @@ def _decodes(store: Study, episodes: pd.DataFrame, columns: Sequence[str]) -> It
             yield {**row, "episode": names[row["episode"]]}
 
 
-def _prompt(store: Study, settings: Mapping[str, Any]) -> int | None:
-    """Return the number of prompt tokens of a setting's policy. None if the policy's files cannot be read here."""
+def _target(store: Study, settings: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the `target.json` of a setting's policy. Empty if the policy's files cannot be read here."""
     name = settings.get("policy", {}).get("target") or ""
     try:
-        return prompt_tokens(read_mapping(find_target(str(store.database.results), name) / "target.json"))
+        return read_mapping(find_target(str(store.database.results), name) / "target.json")
     except KervError:
-        return None
+        return {}
 
 
 def _line(row: Mapping[str, Any], levels: int) -> dict[str, Any]:

@@ -166,7 +166,7 @@ def entries_of(target: Any, episode: DemoEpisode, space: ObservationSpace, key: 
         "seed": np.full(len(steps), episode.seed),
         "step": steps.astype(np.int64),  # control steps since the start
         "left": episode.steps - steps,  # control steps until the success
-        "tokens": tokens.astype(np.uint8),
+        "tokens": tokens.astype(np.min_scalar_type(target.actions.tokens - 1)),
         "keys": np.concatenate(keys),
     }
 

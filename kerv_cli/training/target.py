@@ -75,6 +75,8 @@ def train_target(settings: TrainTargetSettings, database: Database, begin: Begin
         dataset = seen_by(dataset, world.camera.name, "the policy would be shown", remedy)
     origin = {"init": read_target(init).sha256} if init else {}
     shapes = asdict(settings.target)
+    if settings.target.code == "bins":  # left out, so that trainings from before there were codes can be resumed
+        del shapes["code"]
     identity = identity_of(train, dataset, target=shapes, tasks=tasks, views=dataset.views, **origin)
     refuse_other(folder, identity, "target", "name")
 

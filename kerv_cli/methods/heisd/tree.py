@@ -69,7 +69,8 @@ def neighbour_tree(
             parents.append(node)
             node = len(tokens)
             tokens.append(token)
-        offer(node, level + 1, last, whole, cost)
+        if group[-1] != space.end:
+            offer(node, level + 1, last, whole, cost)
     return Draft.of(tokens, parents)
 
 

@@ -108,7 +108,8 @@ def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome
     for index in decode.filled or range(max(0, executed - decode.compensated), executed):
         if outcomes[index].kind != "rejected":
             outcomes[index] = TokenOutcome("compensated")
-    for index in range(executed, size):
+    written = executed if decode.compensated else min(executed, len(decode.tokens))  # an end token ends a chunk early
+    for index in range(written, size):
         if outcomes[index].kind != "rejected":
             outcomes[index] = replace(outcomes[index], kind="dropped")
     for index, token in enumerate(decode.tokens[:size]):

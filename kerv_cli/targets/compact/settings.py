@@ -38,8 +38,11 @@ class TargetSettings:
             prefix: Start of the settings' names in error messages, such as `target.`.
 
         Raises:
-            UsageError: The width is no multiple of twice the heads, or the image no multiple of 8 times the grid.
+            UsageError: The width is no multiple of twice the heads, or the image no multiple of 8 times the grid. Or a
+                parallel target has chunks of different lengths.
         """
+        if self.parallel and self.code != "bins":
+            raise UsageError(f"{prefix}parallel=true: chunks of {prefix}code={self.code} differ in length; use bins")
         if self.width % (2 * self.heads):
             raise UsageError(f"{prefix}width={self.width} must be a multiple of 2 x {prefix}heads={self.heads}")
         if self.observation == "vision" and self.image_size % (8 * self.grid):
