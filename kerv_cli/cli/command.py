@@ -1,4 +1,4 @@
-"""Declare the commands of `kerv`: the decorator `command(NAME)` turns a function into the command `kerv NAME`.
+"""Declare the commands of `kerv`: the decorator `command` turns a function into the command of that name.
 
 The decorator puts the function into kerv's registry. From that entry (a `Part` of kind `command`) this module makes
 typer's command with its options, settings, help and completion. The function can have these parameters:
