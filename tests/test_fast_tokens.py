@@ -17,6 +17,7 @@ from kerv_cli.methods.context import Context
 from kerv_cli.methods.lookup import LookupProposer, LookupProposerSettings
 from kerv_cli.methods.motion import MotionRule
 from kerv_cli.methods.settings import MethodSettings
+from kerv_cli.report.viewing.token_outcomes import chunk_size, outcomes_of, token_names
 
 RNG = np.random.default_rng(0)
 CHUNKS = np.cumsum(RNG.normal(0, 0.2, (400, 4, 7)), 1).clip(-1, 1)
@@ -120,3 +121,16 @@ def test_a_coarse_boundary_ends_chunks_early_with_a_complete_motion():
     assert record.tokens == whole.tokens[:3]
     assert record.size == record.forwards == 3
     assert record.actions.shape == whole.actions.shape
+
+
+def test_tokens_of_a_code_are_shown_by_their_place_alone():
+    decoder = Decoder(TARGET)
+    records = [decoder.decode(shown(number)) for number in range(4)]
+    assert token_names(records, SPACE.names) == ["token"]
+    size = chunk_size(records, 1)
+    assert size == max(len(record.tokens) for record in records)
+    for record in records:
+        kinds = [outcome.kind for outcome in outcomes_of(record, size, 1)]
+        assert kinds == ["target"] * len(record.tokens) + ["dropped"] * (size - len(record.tokens))
+    bins = Decoder(MockTarget(SEVEN, 4, seed=2)).decode(shown(1))
+    assert token_names([bins], SEVEN.names) == SEVEN.names

@@ -32,7 +32,7 @@ from kerv_cli.catalogue.episodes import FoundEpisode, find_episode, outcomes
 from kerv_cli.engine.record import PHASES, DecodeRecord
 from kerv_cli.lab.store import IMPORT
 from kerv_cli.report.viewing.film import Film, animation, film_of
-from kerv_cli.report.viewing.token_outcomes import OUTCOMES, chunk_size, outcomes_of, tokens_hash
+from kerv_cli.report.viewing.token_outcomes import OUTCOMES, chunk_size, outcomes_of, token_names, tokens_hash
 from kerv_cli.report.viewing.viewer import viewer_command
 from kerv_cli.worlds import specs
 
@@ -81,7 +81,7 @@ def show_episode(request: Request) -> Response:
     """Show one episode. `?decode=N` chooses a decode."""
     found = _found(request)
     (decodes, steps), episode, row = found.decodes(), found.episode, found.row
-    names = _names(episode.task, decodes)
+    names = token_names(decodes, _names(episode.task, decodes))
     size = chunk_size(decodes, len(names))
     chunks = [outcomes_of(decode, size, len(names)) for decode in decodes]
     counts = Counter(values_of(itertools.chain.from_iterable(chunks), "kind"))

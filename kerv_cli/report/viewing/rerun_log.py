@@ -32,6 +32,7 @@ from kerv_cli.report.viewing.token_outcomes import (
     readable,
     summary,
     threshold_of,
+    token_names,
     tokens_hash,
 )
 
@@ -177,7 +178,7 @@ def _log_world(log: _Log, record: EpisodeRecord) -> None:
 
 def _log_tokens(log: _Log, record: EpisodeRecord) -> None:
     """Log for each decode: its mode, the outcome of each token of its chunk as coloured bars, and a table."""
-    starts, names = np.asarray(record.decode_steps, dtype=np.int64), record.space.names
+    starts, names = np.asarray(record.decode_steps, dtype=np.int64), token_names(record.decodes, record.space.names)
     size = chunk_size(record.decodes, len(names))
     turns, changes, texts, kinds = [], [], [], []
     modes: list[str] = []

@@ -70,6 +70,16 @@ def threshold_of(decode: DecodeRecord) -> tuple[int, ...]:
     return next(filter(None, values_of(decode.rounds, "threshold")), ())
 
 
+def is_coded(decode: DecodeRecord) -> bool:
+    """Return whether the tokens are a code of the whole chunk (docs/methods.md §0.3): N is then no multiple of D."""
+    return decode.actions.ndim == 2 and decode.size % decode.actions.shape[1] != 0
+
+
+def token_names(decodes: Sequence[DecodeRecord], dofs: Sequence[str]) -> Sequence[str]:
+    """Return the names of a control step's tokens: those of the `dofs`, or a single name for tokens of a code."""
+    return ["token"] if any(map(is_coded, decodes)) else dofs
+
+
 def chunk_size(decodes: Sequence[DecodeRecord], dofs: int) -> int:
     """Return N, the number of tokens of a chunk, as seen in an episode's decodes.
 
@@ -82,7 +92,9 @@ def chunk_size(decodes: Sequence[DecodeRecord], dofs: int) -> int:
     """
     most = 1
     for decode in decodes:
-        most = max(most, decode.size, len(decode.tokens), len(decode.actions) * dofs)
+        most = max(most, len(decode.tokens))
+        if not is_coded(decode):
+            most = max(most, decode.size, len(decode.actions) * dofs)
         for one in decode.rounds:
             most = max(most, one.start + max(len(one.drafted), len(one.target_tokens)))
     return -(-most // dofs) * dofs
@@ -99,7 +111,7 @@ def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome
         size: N, tokens per chunk.
         dofs: D, tokens per control step.
     """
-    executed = len(decode.actions) * dofs
+    executed = len(decode.tokens) if is_coded(decode) else len(decode.actions) * dofs
     outcomes = [TokenOutcome(_unjudged(decode))] * size
     for one_round in decode.rounds:
         for index, outcome in _judged(one_round):
@@ -108,8 +120,7 @@ def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome
     for index in decode.filled or range(max(0, executed - decode.compensated), executed):
         if outcomes[index].kind != "rejected":
             outcomes[index] = TokenOutcome("compensated")
-    written = executed if decode.compensated else min(executed, len(decode.tokens))  # an end token ends a chunk early
-    for index in range(written, size):
+    for index in range(executed, size):
         if outcomes[index].kind != "rejected":
             outcomes[index] = replace(outcomes[index], kind="dropped")
     for index, token in enumerate(decode.tokens[:size]):
