@@ -70,14 +70,20 @@ def threshold_of(decode: DecodeRecord) -> tuple[int, ...]:
     return next(filter(None, values_of(decode.rounds, "threshold")), ())
 
 
-def is_coded(decode: DecodeRecord) -> bool:
-    """Return whether the tokens are a code of the whole chunk (docs/methods.md §0.3): N is then no multiple of D."""
-    return decode.actions.ndim == 2 and decode.size % decode.actions.shape[1] != 0
-
-
 def token_names(decodes: Sequence[DecodeRecord], dofs: Sequence[str]) -> Sequence[str]:
-    """Return the names of a control step's tokens: those of the `dofs`, or a single name for tokens of a code."""
-    return ["token"] if any(map(is_coded, decodes)) else dofs
+    """Return the names of a control step's tokens: those of the `dofs`, or a single name for tokens of a code.
+
+    A code of whole chunks (docs/methods.md §0.3) shows in a decode whose tokens fill no whole control steps.
+    """
+    for decode in decodes:
+        if not decode.compensated and len(decode.tokens) % len(dofs):
+            return ["token"]
+    return dofs
+
+
+def _is_coded(decode: DecodeRecord, dofs: int) -> bool:
+    """Return whether the tokens are shown without DoFs, as `token_names` chose."""
+    return decode.actions.ndim == 2 and decode.actions.shape[1] != dofs
 
 
 def chunk_size(decodes: Sequence[DecodeRecord], dofs: int) -> int:
@@ -93,7 +99,7 @@ def chunk_size(decodes: Sequence[DecodeRecord], dofs: int) -> int:
     most = 1
     for decode in decodes:
         most = max(most, len(decode.tokens))
-        if not is_coded(decode):
+        if not _is_coded(decode, dofs):
             most = max(most, decode.size, len(decode.actions) * dofs)
         for one in decode.rounds:
             most = max(most, one.start + max(len(one.drafted), len(one.target_tokens)))
@@ -111,7 +117,7 @@ def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome
         size: N, tokens per chunk.
         dofs: D, tokens per control step.
     """
-    executed = len(decode.tokens) if is_coded(decode) else len(decode.actions) * dofs
+    executed = len(decode.tokens) if _is_coded(decode, dofs) else len(decode.actions) * dofs
     outcomes = [TokenOutcome(_unjudged(decode))] * size
     for one_round in decode.rounds:
         for index, outcome in _judged(one_round):
