@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from kerv_cli.base.rows import values_of
 from kerv_cli.bench.expected import TABLES, nearest_table
 from kerv_cli.bench.physics import DEVICES
 from kerv_cli.bench.prices import ACTION, ANCHORS, Answer, Estimate, Projection
@@ -99,7 +98,7 @@ def part_rows(estimates: Sequence[Estimate]) -> list[Row]:
 def family_rows(estimates: Sequence[Estimate]) -> list[Row]:
     """Return one row per family of methods. Each cell lists the figures of all engines."""
     rows = []
-    for answers in zip(*values_of(estimates, "answers"), strict=True):
+    for answers in zip(*[one.answers for one in estimates], strict=True):
         family = answers[0].family
         row = {
             "family": family.name,
@@ -236,7 +235,7 @@ def notes(policy: Described | None, estimates: Sequence[Estimate]) -> list[str]:
     """Return the assumptions behind the tables, one line each."""
     table = nearest_table(estimates[0].tokens)
     source = "this installation has no results/tables"
-    if any(values_of(estimates[0].answers, "recorded")):
+    if any(one.recorded for one in estimates[0].answers):
         length = TABLES[table]
         source = f"results/tables/{table}.csv, {length} tokens per chunk, on its own tasks; yours may be lower"
     assumed = [f"assumed: {'; '.join(policy.assumed)}"] if policy and policy.assumed else []

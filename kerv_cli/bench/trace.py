@@ -18,7 +18,6 @@ import numpy as np
 from kerv_cli.base import manifests
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.limits import number
-from kerv_cli.base.rows import values_of
 from kerv_cli.bench.expected import Decodes, Drafts
 from kerv_cli.engine.cost import COUNTED, READ_PHASES, Work, prices, work_of
 from kerv_cli.engine.record import PARALLEL
@@ -176,8 +175,8 @@ def work_of_trace(decodes: Sequence[TracedDecode], tokens: int) -> Work:
             phases[name][number_] = decode.seconds.get(name, 0.0)
         phases["vision"][number_] = decode.encoded
     columns = {name: np.array(list(map(itemgetter(name), rounds))) for name in COUNTED}
-    counts = np.array(list(map(len, values_of(decodes, "rounds"))))
-    searched = np.array(values_of(decodes, "searched"))
+    counts = np.array([len(one.rounds) for one in decodes])
+    searched = np.array([one.searched for one in decodes])
     return work_of(columns, counts, phases, searched, tokens)
 
 

@@ -25,7 +25,6 @@ from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
 from kerv_cli.base.errors import NO_RERUN, KervError, has_rerun
-from kerv_cli.base.rows import values_of
 from kerv_cli.board.pages import CONTENT_POLICY, database_of, inside, render
 from kerv_cli.board.recorder import Recorder
 from kerv_cli.catalogue.episodes import FoundEpisode, find_episode, outcomes
@@ -84,7 +83,7 @@ def show_episode(request: Request) -> Response:
     names = token_names(decodes, _names(episode.task, decodes))
     size = chunk_size(decodes, len(names))
     chunks = [outcomes_of(decode, size, len(names)) for decode in decodes]
-    counts = Counter(values_of(itertools.chain.from_iterable(chunks), "kind"))
+    counts = Counter(one.kind for one in itertools.chain.from_iterable(chunks))
     command, why_not = command_of(found)
     text = request.query_params.get("decode", "")
     chosen = int(text) if re.fullmatch(r"\d{1,6}", text) and int(text) < len(decodes) else 0

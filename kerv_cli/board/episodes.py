@@ -12,7 +12,6 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from kerv_cli.base.errors import UnknownName
-from kerv_cli.base.rows import distinct, values_of
 from kerv_cli.board import episode
 from kerv_cli.board.pages import database_of, render
 from kerv_cli.catalogue.episodes import outcomes, settings_in
@@ -186,7 +185,7 @@ def _asked(request: Request) -> tuple[list[Cell], dict[str, Any]]:
     store = Study(database_of(request), request.path_params["name"])
     baseline, settings = settings_in(store)
     cells = cells_of(outcomes(store), baseline, settings)
-    known = {"setting": list(settings), "task": sorted(distinct(cells, "task"))}
+    known = {"setting": list(settings), "task": sorted(dict.fromkeys(one.task for one in cells))}
     chosen = {name: request.query_params.get(name, "") for name in known}
     for name, value in chosen.items():
         if value and value not in known[name]:
@@ -198,7 +197,7 @@ def _asked(request: Request) -> tuple[list[Cell], dict[str, Any]]:
 def show_episodes(request: Request) -> Response:
     """Show all episodes of a study as a grid."""
     cells, asked = _asked(request)
-    counts = Counter(values_of(cells, "kind"))
+    counts = Counter(one.kind for one in cells)
     return render(request, "episodes.html", grids=grids_of(cells), counts=counts, outcomes=OUTCOMES, **asked)
 
 

@@ -12,7 +12,6 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.rows import values_of
 from kerv_cli.board.pages import database_of, refreshed, render
 from kerv_cli.catalogue.entries import RunEntry, find_runs
 from kerv_cli.report.compare import compare, pairs_to_compare
@@ -40,7 +39,7 @@ def show_runs(request: Request, version: str, is_live: bool) -> Response:
     asked = {name: request.query_params.get(name, "") for name in ("kind", "state", "text", "sort")}
     only = request.app.state.only
     every = [run for run in find_runs(database_of(request)) if not only or run.id in only]
-    kinds = Counter(values_of(every, "kind"))
+    kinds = Counter(one.kind for one in every)
     runs = [run for run in every if _agrees(run, asked)]
     order = asked["sort"].removeprefix("-")
     if order in ORDERS:

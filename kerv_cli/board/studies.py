@@ -13,7 +13,6 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.rows import values_of
 from kerv_cli.board.pages import database_of, refreshed, render
 from kerv_cli.catalogue.entries import find_runs, parents
 from kerv_cli.lab.database import Database
@@ -63,7 +62,7 @@ def show_study(request: Request, version: str, is_live: bool) -> Response:
         run=run,
         title=run.id,
         parents=parents(run, runs),
-        known=set(values_of(runs, "id")),
+        known={one.id for one in runs},
         version=version,
         is_live=is_live and run.is_running,
     )
@@ -76,7 +75,7 @@ def show_tables(request: Request) -> Response:
     """Show the report of a study: its verdict, tables and charts."""
     database, name = database_of(request), request.path_params["name"]
     store = Study(database, name)
-    is_running = RUNNING in values_of(run_rows(database, store.kind, name), "status")
+    is_running = RUNNING in [one.status for one in run_rows(database, store.kind, name)]
     version = f"{store.version()}/{is_running}"
     if request.query_params.get("known") == version:
         return Response(status_code=204)

@@ -7,7 +7,6 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from kerv_cli.base.errors import KervError, UsageError
-from kerv_cli.base.rows import values_of
 from kerv_cli.board.pages import database_of, refreshed, render
 from kerv_cli.catalogue.entries import RunEntry, children, description_of, disk_bytes, find_run, find_runs, parents
 from kerv_cli.report.tables import flatten
@@ -29,7 +28,7 @@ def show_artifact(request: Request, version: str, is_live: bool) -> Response:
         size=disk_bytes(run.folder),
         parents=parents(run, runs),
         children=children(run, runs),
-        known=set(values_of(runs, "id")),
+        known={one.id for one in runs},
         chart=_curves(run),
         settings=flatten(described.get("settings", {})),
         commit=described.get("git_commit", ""),

@@ -27,7 +27,6 @@ from kerv_cli.base.leftovers import clean, temporary_beside
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.paths import shipped_dir
 from kerv_cli.base.registry import ArtifactPart
-from kerv_cli.base.rows import keyed
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.lab.database import ABOUT, EPISODES, SETTINGS, STUDIES, WANTED, Database
@@ -192,7 +191,7 @@ def find_run(database: Database, name: str, exact: bool = False) -> RunEntry:
         raise UsageError(f"no runs in {database.results}: make one with 'kerv rollout method=spec_vla task=reach'")
     if name == LAST and not exact:
         return runs[0]
-    by_id = keyed(runs, "id")
+    by_id = {one.id: one for one in runs}
     found = [name] if name in by_id or exact else [one for one in by_id if name in one]
     if len(found) > 1:
         raise UsageError(f"'{name}' is a part of {len(found)} runs: {', '.join(found[:5])}")

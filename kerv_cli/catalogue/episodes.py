@@ -10,7 +10,6 @@ from typing import Any
 import sqlalchemy as sa
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.rows import keyed
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.episodes.identity import Setting
 from kerv_cli.lab.database import BLOCKS, EPISODES, SETTINGS, STUDIES, WANTED, Database, measures_in
@@ -50,7 +49,7 @@ def outcomes(store: Study, task: str = "", seed: int | None = None) -> list[Any]
         `closest_approach`, `object_moved`, `failed` (whether the last attempt to run it raised an error).
     """
     with store.database.reading() as connection:
-        measures = keyed(measures_in(connection), "name")
+        measures = {one.name: one for one in measures_in(connection)}
         query = (
             sa.select(
                 SETTINGS.c.label, WANTED.c.task, WANTED.c.seed, WANTED.c.episode_id.label("episode"),

@@ -29,7 +29,6 @@ from kerv_cli.base.config import compose, groups, plain_text
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.paths import check_writable
 from kerv_cli.base.registry import MODULES, NoSettings, Part, parts
-from kerv_cli.base.rows import keyed
 from kerv_cli.base.settings import CommandSettings, choices_of
 from kerv_cli.cli.common import settings_yaml
 
@@ -83,7 +82,7 @@ def schemas_of(part: Command) -> list[type]:
 
 def fields_of(settings: Any) -> dict[str, Field[Any]]:
     """Return the fields of a settings dataclass by name."""
-    return keyed(fields(settings), "name")
+    return {one.name: one for one in fields(settings)}
 
 
 def top_keys(part: Command) -> list[str]:

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from kerv_cli.base.rows import values_of
 from kerv_cli.bench.settings import EstimateSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, end_with_json, print_rows
@@ -86,7 +85,7 @@ def _print_tables(policy: Described | None, title: str, estimates: Sequence[Esti
     from kerv_cli.bench.tables import family_rows, part_rows
 
     if policy and policy.shape:
-        engines = " / ".join(values_of(estimates, "costs.name"))
+        engines = " / ".join(one.costs.name for one in estimates)
         title = f"{policy.shape.name} on {title}, computed, not measured: {engines}"
     print_rows(part_rows(estimates), title)
     print_rows(family_rows(estimates), "speed against AR; break-even: accepted tokens per verification")
@@ -100,7 +99,7 @@ def _trace(settings: EstimateSettings, as_json: bool) -> None:
     from kerv_cli.bench.trace import CANNOT, choose_length, price, read_trace
 
     trace = read_trace(as_path(settings.trace))
-    settings.prompt = settings.prompt or next(filter(None, values_of(trace, "prompt")), None)
+    settings.prompt = settings.prompt or next(filter(None, [one.prompt for one in trace]), None)
     answer = choose_length if settings.choose == "draft" else price
     documents, rows = [], []
     for title, costs in _costs(settings, None if settings.on else described(settings)):

@@ -23,7 +23,6 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_json
 from kerv_cli.base.paths import beside, results_dir
 from kerv_cli.base.registry import METHOD_KINDS
-from kerv_cli.base.rows import values_of
 from kerv_cli.episodes.identity import ENGINE
 from kerv_cli.episodes.policy import artifacts_of
 from kerv_cli.episodes.resolve import ResolvedStudy
@@ -118,7 +117,7 @@ def planned_certificate(
     tested = _candidates(resolved)
     first = next(iter(tested.values()))
     artifacts, tasks = artifacts_of(first), resolve_tasks(first.task)
-    needs = values_of(map(Method.of, tested.values()), "needs")
+    needs = [one.needs for one in map(Method.of, tested.values())]
     hashes = artifacts.check(itertools.chain.from_iterable(needs))
     candidates = []
     for label, one in tested.items():
@@ -136,7 +135,7 @@ def planned_certificate(
         dtype=first.runtime.dtype,
         margin=settings.margin,
         delta=settings.delta,
-        seeds=seeds_text(values_of(wanted, "seed")),
+        seeds=seeds_text([one.seed for one in wanted]),
         candidates=candidates,
         chosen=None,
         provenance={"command": "kerv calibrate success", "engine": ENGINE, **provenance(first.runtime.device)},
@@ -175,11 +174,11 @@ def charged(
     if earlier and not again:
         raise UsageError(
             f"this policy has had {count(len(earlier), 'test')}, on seeds "
-            f"{', '.join(values_of(earlier, 'seeds'))}: another one is another chance to certify falsely. Set "
+            f"{', '.join(one.seeds for one in earlier)}: another one is another chance to certify falsely. Set "
             f"again=true to test on other seeds at delta={certificate.delta / 2 ** len(earlier):g}"
         )
     for attempt in earlier:
-        if not attempt.seeds_served.isdisjoint(values_of(episodes, "seed")):
+        if not attempt.seeds_served.isdisjoint([one.seed for one in episodes]):
             raise UsageError(f"seeds {attempt.seeds} served an earlier test of this policy: set seed= to others")
     if study := _other_study(certificate.target, store, episodes):
         raise UsageError(f"study '{study}' ran this policy on some of these seeds: set seed= to others")
@@ -206,7 +205,7 @@ def attempts_on(target: str, folders: Iterable[Path]) -> list[Attempt]:
 
 def _other_study(target: str, store: Study, episodes: Sequence[Episode]) -> str:
     """Return the name of another study in which the policy ran some of these episodes. Empty if there is none."""
-    wanted, seeds = set(map(attrgetter("task", "seed"), episodes)), values_of(episodes, "seed")
+    wanted, seeds = set(map(attrgetter("task", "seed"), episodes)), [one.seed for one in episodes]
     query = (
         sa.select(STUDIES.c.name, SETTINGS.c.identity, WANTED.c.task, WANTED.c.seed)
         .select_from(WANTED.join(SETTINGS).join(STUDIES))
@@ -234,7 +233,7 @@ def certify(certificate: Certificate, store: Study, wanted: Sequence[Episode], b
     """
     episodes = load_study(store, wanted).episodes
     episodes = episodes[episodes["repeat"] == 0]  # a repeat measures the same world again: it is no further pair
-    pairs = paired(episodes, dict.fromkeys(values_of(certificate.candidates, "label"), baseline))
+    pairs = paired(episodes, dict.fromkeys([one.label for one in certificate.candidates], baseline))
     testing = bool(episodes.loc[episodes["label"] == baseline, "success"].mean() >= SOLVED_BY_AR)
     candidates: list[Candidate] = []
     chosen = None

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import pandas as pd
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.rows import distinct, values_of
 from kerv_cli.catalogue.entries import RunEntry, description_of, find_run, store_of
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, without
 from kerv_cli.lab.database import Database
@@ -147,8 +146,8 @@ def _settings_of(side: ComparedRun) -> Row:
     settings = flatten(without(setting.settings, NOT_DETERMINING - {"policy", "method"}))
     for name, value in without(setting.identity, {OBSERVATION}).items():
         settings[name] = value[:12]
-    settings["tasks"] = ";".join(sorted(distinct(wanted, "task")))
-    settings["seeds"] = seeds_text(values_of(wanted, "seed"))
+    settings["tasks"] = ";".join(sorted(dict.fromkeys(one.task for one in wanted)))
+    settings["seeds"] = seeds_text([one.seed for one in wanted])
     for name in _PROVENANCE:
         if name in episodes:
             settings[name] = ";".join(sorted(split_values(episodes[name].dropna())))

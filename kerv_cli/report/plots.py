@@ -21,7 +21,6 @@ from PIL import Image
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import write_if_changed
-from kerv_cli.base.rows import distinct, values_of
 from kerv_cli.report.results import Result, averaged, frame_of, is_number
 from kerv_cli.report.summary import MAIN, summary_frame
 from kerv_cli.report.tables import NO_STRESS, is_stressed
@@ -75,9 +74,9 @@ def study_figures(results: Sequence[Result], axis: str, loss: float = 3.0) -> di
 
 def about(results: Sequence[Result]) -> str:
     """Return the subtitle of a chart: policies, number of settings, tasks and episodes, device, number format."""
-    labels = distinct(results, "label")
+    labels = list(dict.fromkeys(one.label for one in results))
     targets = list(dict.fromkeys(str(row.settings["policy.target"]) for row in results))
-    tasks, episodes = max(values_of(results, "tasks")), max(values_of(results, "episodes"))
+    tasks, episodes = max(one.tasks for one in results), max(one.episodes for one in results)
     names = ", ".join(targets) if len(targets) <= 2 else f"{len(targets)} policies"
     counts = f"{count(len(labels), 'setting')} on {count(tasks, 'task')}, {count(episodes, 'episode')} each"
     return f"{names} · {counts} · {results[0].provenance['device_name']}, {results[0].settings['runtime.dtype']}"

@@ -16,7 +16,6 @@ import pandas as pd
 import pyarrow.compute as pc
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.rows import values_of
 from kerv_cli.engine.cost import COUNTED, READ_PHASES, Profile, Work, prices, read_profile, work_of
 from kerv_cli.report.measures import measure, paired
 from kerv_cli.report.profiles import ENCODERS, NamedProfile, open_profiles
@@ -64,7 +63,7 @@ class Priced:
 
 def prices_table(priced: Iterable[Priced]) -> pd.DataFrame:
     """Return the estimated speeds as a data frame: one row per machine and setting."""
-    return pd.DataFrame(values_of(priced, "columns"))
+    return pd.DataFrame([one.columns for one in priced])
 
 
 def repriced(data: StudyData, profiles: Sequence[NamedProfile], lenient: bool = False) -> list[Priced]:

@@ -11,8 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kerv_cli.base.rows import values_of
-
 
 class Estimate(NamedTuple):
     """An estimated value with the lower and upper end of its confidence interval (95 % unless said otherwise)."""
@@ -274,7 +272,7 @@ def over_runs(estimates: Sequence[Estimate], same_pairs: bool) -> Estimate:
     """
     from scipy.special import stdtrit
 
-    logs = np.log(values_of(estimates, "value"))
+    logs = np.log([one.value for one in estimates])
     reach = float(stdtrit(len(logs) - 1, 0.975)) * float(logs.std(ddof=1)) / math.sqrt(len(logs))
     if same_pairs:
         reach = math.hypot(reach, float(np.mean([math.log(one.high / one.value) for one in estimates])))

@@ -15,7 +15,6 @@ from rich.table import Table
 from rich.text import Text
 
 from kerv_cli.base.durations import count
-from kerv_cli.base.rows import distinct, values_of
 from kerv_cli.engine.record import PHASES
 from kerv_cli.episodes.identity import stress_text
 from kerv_cli.report.results import MICRO, Result, averaged, is_number
@@ -142,7 +141,7 @@ class SummaryTable:
         """Yield the title, the table and the notes below it."""
         rows = averaged(self.results)
         first = rows[0]
-        tasks, episodes = max(values_of(rows, "tasks")), max(values_of(rows, "episodes"))
+        tasks, episodes = max(one.tasks for one in rows), max(one.episodes for one in rows)
         counts = f"{count(tasks, 'task')}, {count(episodes, 'episode')} per setting"
         device = f"{first.provenance['device_name']}, {first.settings['runtime.dtype']}"
         yield Text(f"{first.study}: {counts}, {device}", "bold", overflow="fold")
@@ -153,7 +152,7 @@ class SummaryTable:
             yield _printed(part)
         if self.how and len(shown.columns) < len(frame.columns):
             yield Text(f"{len(shown.columns)} of {len(frame.columns)} columns; {self.how} shows all")
-        several = ", under the same stress and clock" if len(distinct(rows, "baseline")) > 1 else ""
+        several = ", under the same stress and clock" if len({one.baseline for one in rows}) > 1 else ""
         yield Text(f"{NOTE} {of_runs(rows)} Baseline: {first.baseline}{several}.")
         if frame[SPEEDS["episode_speedup"]].str.endswith(APART).any():
             yield Text(f"{APART} only from pairs that were measured in turn")
@@ -163,7 +162,7 @@ class SummaryTable:
 
 def of_runs(results: Sequence[Result]) -> str:
     """Return one sentence that says from how many runs the intervals of speed were computed."""
-    runs = min(values_of(results, "runs"))
+    runs = min(one.runs for one in results)
     return f"Intervals of speed: of {runs} runs." if runs > 2 else "Intervals of speed: of this run alone."
 
 

@@ -17,7 +17,6 @@ import pandas as pd
 import pyarrow.compute as pc
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.rows import distinct, keyed, values_of
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, Setting, flat, stress_of, without
 from kerv_cli.lab.plan import Episode, seeds_text
 from kerv_cli.lab.store import Study
@@ -79,7 +78,7 @@ class StudyData:
     @functools.cached_property
     def settings(self) -> dict[str, Setting]:
         """The settings by label."""
-        return keyed(self.study.settings, "label")
+        return {one.label: one for one in self.study.settings}
 
     @functools.cached_property
     def labels(self) -> list[str]:
@@ -141,7 +140,7 @@ class StudyData:
         The slowest has NaN. Empty if the settings are compared with several baselines, or if fewer than two were timed.
         """
         timed = [row for row in averaged(self.results) if is_number(row.speed)]
-        order = values_of(sorted(timed, key=attrgetter("speed"), reverse=True), "label")
+        order = [one.label for one in sorted(timed, key=attrgetter("speed"), reverse=True)]
         if len(order) < 2 or len(set(self.references.values())) > 1:
             return []
         next_ones = dict(itertools.pairwise(order))
@@ -483,7 +482,8 @@ def summed_table(results: Iterable[Result]) -> pd.DataFrame:
     """
     rows = [row for row in averaged(results) if row.stress != NO_STRESS]
     reference = next((row.unstressed for row in rows if row.is_baseline), "")
-    kinds, levels = distinct(rows, "stress"), map("level {}".format, distinct(rows, "stress_level"))
+    kinds = dict.fromkeys(one.stress for one in rows)
+    levels = dict.fromkeys(f"level {one.stress_level}" for one in rows)
     sums = []
     for name in (*sorted(kinds), *sorted(levels), "all"):
         methods: dict[str, list[Result]] = {}
@@ -498,8 +498,8 @@ def summed_table(results: Iterable[Result]) -> pd.DataFrame:
 
 def _pooled(rows: Sequence[Result]) -> dict[str, Any]:
     """Return the success of several settings together, and how it compares with their baselines."""
-    episodes, successes = sum(values_of(rows, "episodes")), sum(values_of(rows, "measures.successes"))
-    counts = PairedCounts(*np.sum(values_of(rows, "measures.counts"), axis=0).tolist())
+    episodes, successes = sum(one.episodes for one in rows), sum(one.measures.successes for one in rows)
+    counts = PairedCounts(*np.sum([one.measures.counts for one in rows], axis=0).tolist())
     success = {"episodes": episodes, "successes": successes, "success": stats.wilson(successes, episodes)}
     return success | compared(counts, stats.paired_difference(counts))
 

@@ -18,7 +18,6 @@ from operator import attrgetter
 from typing import NamedTuple
 
 from kerv_cli.base.durations import count
-from kerv_cli.base.rows import distinct, values_of
 from kerv_cli.report import statistics as stats
 from kerv_cli.report.measures import MARGIN
 from kerv_cli.report.results import Result, Row, averaged, columns_of, is_number
@@ -109,7 +108,7 @@ def choose(where: str, rows: Sequence[Result], loss: float) -> Choice:
     if undecided.is_unsolved:
         return undecided
     order = safest_first(rows)
-    undecided = replace(undecided, front=tuple(values_of(pareto(rows), "label")), tested=len(order))
+    undecided = replace(undecided, front=tuple(one.label for one in pareto(rows)), tested=len(order))
     best = _fastest(passing(order, loss / POINTS))
     if best is None:
         return _with_candidate(undecided, order, loss)
@@ -221,7 +220,7 @@ def with_matched_speed(rows: Sequence[Result]) -> list[Result]:
             groups.setdefault((row.where, row.method, row.baseline), []).append(row)
     fastest: dict[tuple[str, str, str], float] = {}
     for key, group in groups.items():
-        speeds = values_of(passing(sorted(group, key=safety), MARGIN), "speed")
+        speeds = [one.speed for one in passing(sorted(group, key=safety), MARGIN)]
         fastest[key] = max((speed for speed in speeds if speed > 0), default=math.nan)
     matched = []
     for row in rows:
@@ -253,10 +252,10 @@ def verdict_of(results: Sequence[Result], loss: float) -> Verdict:
         loss: Largest acceptable loss of success against the baseline, in points (percentage points).
     """
     rows = averaged(results)
-    if not any(values_of(rows, "is_compared")):
+    if not any(one.is_compared for one in rows):
         rates = ", ".join(f"{row.label} {POINTS * row.measures.success.value:.1f} %" for row in rows)
         return Verdict(f"success: {rates}.")
-    if len(distinct(rows, "baseline")) > 1:
+    if len({one.baseline for one in rows}) > 1:
         return Verdict(f"{under_conditions(rows)}.")
     found = choose("all tasks", rows, loss)
     episodes = math.ceil(found.candidate_pairs / rows[0].tasks) if found.candidate_pairs <= stats.MOST_PAIRS else 0
@@ -270,10 +269,10 @@ def question(results: Sequence[Result], loss: float) -> str:
         results: The study's rows over all tasks.
         loss: Largest acceptable loss of success, in points.
     """
-    baselines = distinct(filter(attrgetter("measures.pairs"), results), "baseline")
+    baselines = list(dict.fromkeys(one.baseline for one in filter(attrgetter("measures.pairs"), results)))
     if len(baselines) > 1:
         return "Which settings succeed less or more often than the baseline under the same stress and clock?"
-    if not baselines or all(values_of(results, "is_baseline")):
+    if not baselines or all(one.is_baseline for one in results):
         return ""
     return f"Which setting is faster than the baseline {baselines[0]} and loses less than {loss:g} points of success?"
 

@@ -20,7 +20,6 @@ from PIL import Image
 from rerun.error_utils import catch_and_log_exceptions
 
 from kerv_cli.base.registry import parts
-from kerv_cli.base.rows import values_of
 from kerv_cli.engine.record import PHASES, EpisodeRecord
 from kerv_cli.report.viewing.token_outcomes import (
     OUTCOMES,
@@ -188,7 +187,7 @@ def _log_tokens(log: _Log, record: EpisodeRecord) -> None:
             changes.append(number)
             modes.append(decode.mode)
         chunk = outcomes_of(decode, size, len(names))
-        kinds.append(values_of(chunk, "kind"))
+        kinds.append([one.kind for one in chunk])
         texts.append(decode_table(decode, number, step, chunk, names))
     log.states("decodes", starts, turns, {"0": ("·", 0x55606BFF), "1": ("·", GREY)})
     shades = {mode: part.colour << 8 | 0xFF for mode, part in parts("proposer").items() if part.colour is not None}
@@ -217,7 +216,7 @@ def _log_numbers(log: _Log, record: EpisodeRecord) -> None:
     steps, starts = np.arange(record.steps + 1, dtype=np.int64), np.asarray(record.decode_steps, dtype=np.int64)
     log.numbers("actions", steps[:-1], names, record.actions)
     log.numbers("gripper", steps, ["gripper opening"], record.gripper[:, None], [YELLOW])
-    log.numbers("decode/forwards", starts, ["forwards"], zip(values_of(decodes, "forwards"), strict=True), [GREY])
+    log.numbers("decode/forwards", starts, ["forwards"], [[one.forwards] for one in decodes], [GREY])
     per_verification = [acceptance([d]) for d in decodes]
     titles = ["tokens committed per verification (AL)", "drafts accepted per verification"]
     log.numbers("decode/acceptance", starts, titles, per_verification, [0x56B4E9FF, 0x009E73FF])
@@ -233,7 +232,7 @@ def _log_numbers(log: _Log, record: EpisodeRecord) -> None:
             times[phase] = milliseconds
     log.numbers("decode/phases", starts, list(times), np.transpose(list(times.values())), [GREY, *COLORS])
     for signal, title in SIGNALS.items():
-        log.numbers(f"signals/{signal}", starts, [title], zip(values_of(decodes, signal), strict=True))
+        log.numbers(f"signals/{signal}", starts, [title], [[getattr(decode, signal)] for decode in decodes])
 
 
 STEP, TIME = "step", "time"

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from kerv_cli.base.rows import values_of
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
 from kerv_cli.episodes.identity import hash_of
 
@@ -67,7 +66,7 @@ class TokenOutcome:
 
 def threshold_of(decode: DecodeRecord) -> tuple[int, ...]:
     """Return the acceptance threshold r of each DoF in a decode, in bins. Empty if the acceptance rule has none."""
-    return next(filter(None, values_of(decode.rounds, "threshold")), ())
+    return next(filter(None, [one.threshold for one in decode.rounds]), ())
 
 
 def token_names(decodes: Sequence[DecodeRecord], dofs: Sequence[str]) -> Sequence[str]:
@@ -167,7 +166,7 @@ def acceptance(decodes: Iterable[DecodeRecord]) -> tuple[float, ...]:
         Mean number of committed tokens, and mean number of accepted draft tokens, per verification. Empty if the
         decodes have no verification.
     """
-    rounds = itertools.chain.from_iterable(values_of(decodes, "rounds"))
+    rounds = itertools.chain.from_iterable(one.rounds for one in decodes)
     counts = [(one.committed, one.accepted) for one in rounds if one.is_verification]
     return tuple(np.mean(counts, axis=0).tolist()) if counts else ()
 
@@ -185,12 +184,12 @@ def readable(text: str) -> str:
 
 def tokens_hash(decodes: Sequence[DecodeRecord]) -> str:
     """Return a hash of all tokens of an episode, decode by decode."""
-    return hash_of(list(map(list, values_of(decodes, "tokens"))))
+    return hash_of([list(one.tokens) for one in decodes])
 
 
 def facts_of(record: EpisodeRecord, method: str) -> dict[str, str | float]:
     """Return the totals of an episode, which the recording stores as its properties."""
-    modes = Counter(values_of(record.decodes, "mode"))
+    modes = Counter(one.mode for one in record.decodes)
     facts: dict[str, str | float] = {
         "environment": readable(record.environment),
         "task": readable(record.task),
@@ -206,8 +205,8 @@ def facts_of(record: EpisodeRecord, method: str) -> dict[str, str | float]:
         "ms_per_step": 1000 * record.seconds / record.steps,
         "inference_seconds": record.seconds,
         "wall_seconds": record.wall_seconds,
-        "skipped_decodes": sum(values_of(record.decodes, "skipped")),
-        "compensated_tokens": sum(values_of(record.decodes, "compensated")),
+        "skipped_decodes": sum(one.skipped for one in record.decodes),
+        "compensated_tokens": sum(one.compensated for one in record.decodes),
     }
     names = ("acceptance_length", "accepted_per_round")
     return facts | dict(zip(names, acceptance(record.decodes)))  # noqa: B905 - there may be none
