@@ -59,14 +59,12 @@ class FastCode:
         """Learn the merges from chunks (n, H, D) of normalised actions."""
         from tokenizers import Tokenizer, models, trainers
 
-        plain = cls(chunks.shape[1], chunks.shape[2], SCALE)
-        room, letters = VOCABULARY - plain.tokens, [chr(FIRST + token) for token in range(plain.end)]
+        plain, merges = cls(chunks.shape[1], chunks.shape[2], SCALE), []
+        letters, size = plain.spellings, max(plain.end, VOCABULARY - 1)  # without the end token
         tokenizer = Tokenizer(models.BPE())
-        size = len(letters) + max(0, room)
         trainer = trainers.BpeTrainer(vocab_size=size, initial_alphabet=letters, show_progress=False)
         tokenizer.train_from_iterator(plain.texts(plain.coefficients(chunks)), trainer)
         numbers = {letter: token for token, letter in enumerate(letters)}
-        merges = []
         for first, second in json.loads(tokenizer.to_str())["model"]["merges"]:
             merges.append((numbers[first], numbers[second]))
             numbers[first + second] = len(numbers)
@@ -100,14 +98,20 @@ class FastCode:
             parts.append(parts[first] + parts[second])
         return [*parts, ()]
 
+    @property
+    def spellings(self) -> list[str]:
+        """For each token except the end token, its text: a character per rounded coefficient."""
+        texts = [chr(FIRST + token) for token in range(2 * self.highest + 1)]
+        for first, second in self.merges:
+            texts.append(texts[first] + texts[second])
+        return texts
+
     @cached_property
     def tokenizer(self) -> Any:
         """The `tokenizers.Tokenizer` that applies the merges to texts."""
         from tokenizers import Tokenizer, models
 
-        texts = [chr(FIRST + token) for token in range(2 * self.highest + 1)]
-        for first, second in self.merges:
-            texts.append(texts[first] + texts[second])
+        texts = self.spellings
         pairs = [(texts[first], texts[second]) for first, second in self.merges]
         return Tokenizer(models.BPE({text: token for token, text in enumerate(texts)}, pairs))
 
@@ -117,13 +121,18 @@ class FastCode:
 
         return np.rint(dct(chunks, axis=1, norm="ortho") * self.scale).astype(np.int64).reshape(len(chunks), -1)
 
-    def values(self, coefficients: Sequence[int]) -> np.ndarray:
-        """Return the normalised actions (H, D) of at most H · D rounded coefficients. Missing coefficients are 0."""
+    def motions(self, coefficients: np.ndarray) -> np.ndarray:
+        """Return the motions (n, H, D) of coefficients (n, H · D): normalised actions that are not clipped yet."""
         from scipy.fft import idct
 
+        found: np.ndarray = idct(coefficients.reshape(-1, self.steps, self.dofs) / self.scale, axis=1, norm="ortho")
+        return found
+
+    def values(self, coefficients: Sequence[int]) -> np.ndarray:
+        """Return the normalised actions (H, D) of at most H · D rounded coefficients. Missing coefficients are 0."""
         full = np.zeros(self.steps * self.dofs)
         full[: len(coefficients)] = coefficients
-        return np.clip(idct(full.reshape(self.steps, self.dofs) / self.scale, axis=0, norm="ortho"), -1.0, 1.0)
+        return np.clip(self.motions(full)[0], -1.0, 1.0)
 
     def texts(self, coefficients: np.ndarray) -> Iterable[str]:
         """Yield a text for each row of coefficients (n, H · D): a character per coefficient, without final zeros."""

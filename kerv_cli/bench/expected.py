@@ -192,7 +192,7 @@ class Decodes:
 
 
 def _least(enough: Callable[[float], bool]) -> float:
-    """Return the smallest probability for which `enough` is true. 1 if there is none.
+    """Return the smallest probability for which `enough` is true. 1 if it is true for no probability.
 
     If `enough` is true for a probability, it must be true for all larger ones.
     """

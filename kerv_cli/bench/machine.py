@@ -36,7 +36,7 @@ class Machine:
     def bandwidth_of(self, read: float) -> float:
         """Return the bytes per second at which the same `read` bytes can be read again and again.
 
-        This is the bandwidth of the smallest measured buffer that holds so many bytes. If there is none, it is
+        This is the bandwidth of the smallest measured buffer that holds the bytes. If no buffer is that large, it is
         `bandwidth`.
         """
         return next((rate for size, rate in self.caches if read <= size), self.bandwidth)

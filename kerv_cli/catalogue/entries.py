@@ -68,7 +68,7 @@ class RunEntry:
         total: Number of episodes or training steps that were planned. 0 if unknown.
         done: Number of planned episodes or training steps that are finished.
         left: While it runs, the estimated remaining time, such as `about 3 min left`.
-        message: Error message of the newest command that makes the entry. Empty if there is none.
+        message: Error message of the newest command that makes the entry. Empty if that command had no error.
         figures: Main results of the entry by name, such as the success rate.
         command: Command-line arguments (without `kerv`) that made it. Empty if unknown.
         sha256: Hash by which other artifacts refer to it.

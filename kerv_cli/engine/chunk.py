@@ -294,9 +294,9 @@ class Chunk:
         self.rounds.append(Round("skip", proposer, drafted=drafted, accepted=size, committed=size))
 
     def until_end(self, tokens: Sequence[int]) -> list[int]:
-        """Return the tokens up to the first end token, or all if there is none."""
-        found = list(tokens)
-        return found[: found.index(self.space.end) + 1] if self.space.end in found else found
+        """Return the tokens up to the first end token. Without an end token, return all."""
+        found, end = list(tokens), self.space.end
+        return found[: found.index(end) + 1] if end is not None and end in found else found
 
     def rectify(self, found: Rectified, with_target_token: bool) -> None:
         """Commit the values that a rectifier predicted.

@@ -100,7 +100,7 @@ def differences(new: Setting, old: Setting | None = None, work: str = "") -> str
 
     Args:
         new: The setting.
-        old: The stored setting; None if there is none.
+        old: The stored setting. None: no setting is stored.
         work: The hash under which `old` was stored.
     """
     target = new.settings["policy"]["target"]

@@ -72,7 +72,7 @@ def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], ki
         point, identity = resolved.points[label], check(one)
         if one.runtime.executor != SLURM:
             one.runtime.device, _ = set_up(one.runtime)
-        elif one.runtime.device == "auto":  # that of the nodes: this machine may have no GPU
+        elif one.runtime.device == "auto":  # the nodes choose their device: this machine may have no GPU
             one.runtime.device = "cuda" if one.runtime.executor_options.gpus else "cpu"
         plain = asdict(one)
         del plain["task"]

@@ -271,7 +271,7 @@ class Queue:
         self.study, self.run, self.database = study, run, study.database
         self.worker = worker_id(os.getpid(), secrets.token_hex(4))
         self._claimed: int | None = None
-        self._settings: dict[str, Setting] = {}  # those of earlier blocks, by their hashes
+        self._settings: dict[str, Setting] = {}  # settings of earlier blocks, by their hashes
 
     def fill(self) -> None:
         """Write the planned study and its blocks, in one transaction.

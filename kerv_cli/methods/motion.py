@@ -68,13 +68,11 @@ class MotionRule(DistanceRule):
     def basis(self) -> np.ndarray:
         """(H · D, H · D) float64. Row i is the flattened motion whose coefficient i is 1, and all others are 0."""
         import numpy as np
-        from scipy.fft import idct
 
         code = self.space.code
         assert code is not None
-        unit = np.eye(code.steps * code.dofs).reshape(-1, code.steps, code.dofs)
-        motions: np.ndarray = idct(unit / code.scale, axis=1, norm="ortho").reshape(len(unit), -1)
-        return motions
+        unit = np.eye(code.steps * code.dofs)
+        return code.motions(unit).reshape(unit.shape)
 
     def limits(self, r: int) -> tuple[int, ...]:
         """Return (0,), because FAST tokens have no distance to each other. The radius `r` is not used."""

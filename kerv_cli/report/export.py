@@ -93,11 +93,11 @@ def _to_trace(store: Study, path: Path) -> Path:
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for label, part in frame.groupby("label", sort=False):
             chosen = settings.get(str(label), {})
-            size = max((len(row["tokens"]) for row in _decodes(store, part, ["tokens"])), default=0)
             target = _target(store, chosen)
             if target.get("actions", {}).get("code"):
                 raise UsageError(f"--to trace: chunks of {label} differ in length, and a trace has one length")
-            prompt, levels = prompt_tokens(target) if target else None, levels_of(chosen)
+            size = max((len(row["tokens"]) for row in _decodes(store, part, ["tokens"])), default=0)
+            prompt, levels = prompt_tokens(target), levels_of(chosen)
             for row in _decodes(store, part, _TRACED):
                 about = {"episode": row["episode"], "setting": label, "prompt": prompt, "tokens": size}
                 file.write(json.dumps({**about, **_line(row, levels)}) + "\n")

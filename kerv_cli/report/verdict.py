@@ -39,14 +39,14 @@ class Choice:
             setting, from the same initial state.
         baseline_success: Success rate of the baseline.
         front: Settings that no other setting beats in both speed and success, the fastest first.
-        chosen: Fastest setting that is shown to lose less success than the bound. Empty if there is none.
+        chosen: Fastest setting that is shown to lose less success than the bound. Empty if no setting is.
         loss_at_most: Upper bound on the chosen setting's loss of success, in points, at 95 % confidence. NaN if no
             setting is chosen.
         candidate: Fastest setting that is not chosen yet, but would be after more pairs if the rates stay the same.
-            Empty if there is none, or if a setting is chosen.
+            Empty if no setting would be, or if a setting is chosen.
         candidate_pairs: About how many pairs in all the candidate needs. NaN without a candidate.
-        tested: Number of settings that are tested for their loss of success: those that are faster than the baseline or
-            were not timed.
+        tested: Number of settings whose loss of success is tested. A setting is tested if it is faster than the
+            baseline or was not timed.
         episode_speedup: Speed per episode of the chosen setting, or else of the candidate, against the baseline. NaN if
             it was not timed.
         runs: Number of runs (commands) from which the interval of `episode_speedup` was computed.

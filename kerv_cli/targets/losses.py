@@ -9,6 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from kerv_cli.base.spaces import ActionSpace
+
 
 def soft_labels(tokens: int, sigma: float) -> Tensor:
     """Return the probabilities (V, V) that a model should predict. Row i holds those for the true token i.
@@ -23,6 +25,14 @@ def soft_labels(tokens: int, sigma: float) -> Tensor:
     if sigma <= 0:
         return torch.eye(tokens)
     return torch.softmax(-((bins[:, None] - bins) ** 2) / (2 * sigma**2), -1)
+
+
+def labels_of(actions: ActionSpace, sigma: float) -> Tensor:
+    """Return `soft_labels` for the tokens of an action space.
+
+    Tokens of a code have no distance to each other. So only the true token has a probability, whatever `sigma` is.
+    """
+    return soft_labels(actions.tokens, sigma if actions.code is None else 0.0)
 
 
 def token_loss(logits: Tensor, tokens: Tensor, labels: Tensor) -> Tensor:

@@ -28,7 +28,7 @@ from kerv_cli.targets.compact.features import places_of
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
-from kerv_cli.targets.losses import position_loss, soft_labels, token_loss
+from kerv_cli.targets.losses import labels_of, position_loss, token_loss
 from kerv_cli.targets.observations import Observations, read_chunks, read_observations, split
 from kerv_cli.training.fit import Metrics
 from kerv_cli.training.settings import TrainSettings
@@ -187,8 +187,7 @@ class Imitation:
     ) -> None:
         self.module, self.settings, self.device, self.closed_loop = target, settings, target.device, closed_loop
         self.training, self.held_out = split(samples, settings.held_out)
-        sigma = settings.label_sigma if target.actions.code is None else 0.0
-        self.labels = soft_labels(target.actions.tokens, sigma).to(self.device)
+        self.labels = labels_of(target.actions, settings.label_sigma).to(self.device)
         self.weights = task_weights(self.training.tasks, settings.balance)
         self.learns_places = bool(target.cameras and settings.scene_weight)
 

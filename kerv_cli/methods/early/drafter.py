@@ -30,7 +30,7 @@ from kerv_cli.methods.drafters import Decodes, Metrics, TrainableDrafter
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.targets.compact.compilable import FORMATS, Compilable
 from kerv_cli.targets.compact.program import Program
-from kerv_cli.targets.losses import soft_labels, token_loss
+from kerv_cli.targets.losses import labels_of, token_loss
 from kerv_cli.targets.observations import observations_of, prompts_of
 from kerv_cli.worlds.demos.files import DemoEpisode
 
@@ -271,8 +271,7 @@ class EarlyDrafter(TrainableDrafter):
             batch: The B training examples.
             settings: Settings of `kerv train drafter`.
         """
-        sigma = settings.train.label_sigma if target.actions.code is None else 0.0
-        labels = _labels(target.actions.tokens, sigma, target.device)
+        labels = _labels(target.actions, settings.train.label_sigma, target.device)
         return token_loss(logits, batch.tokens.to(target.device), labels)
 
     def loss(self, network: Any, target: Any, batch: Any, step: int, settings: Any) -> tuple[Tensor, Metrics]:
@@ -298,8 +297,8 @@ class EarlyDrafter(TrainableDrafter):
 
 
 @functools.lru_cache(maxsize=1)
-def _labels(tokens: int, sigma: float, device: torch.device) -> Tensor:
-    return soft_labels(tokens, sigma).to(device)
+def _labels(actions: ActionSpace, sigma: float, device: torch.device) -> Tensor:
+    return labels_of(actions, sigma).to(device)
 
 
 def measure(logits: Tensor, examples: Decodes, strict: Tensor) -> Metrics:

@@ -39,7 +39,7 @@ from kerv_cli.worlds.demos.files import DemoEpisode
 class ScoutNetwork(Compilable):
     """The network from an observation to the logits of a chunk (N tokens, V bins).
 
-    It also estimates K positions: those of the task's places, such as object and goal.
+    It also estimates the positions of the task's K places, such as object and goal.
     """
 
     centre: Tensor

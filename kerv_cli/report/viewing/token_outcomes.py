@@ -70,7 +70,7 @@ def threshold_of(decode: DecodeRecord) -> tuple[int, ...]:
 
 
 def token_names(decodes: Sequence[DecodeRecord], dofs: Sequence[str]) -> Sequence[str]:
-    """Return the names of a control step's tokens: those of the `dofs`, or a single name for tokens of a code.
+    """Return the names of a control step's tokens: the names `dofs`, or a single name for tokens of a code.
 
     A code of whole chunks (docs/methods.md §0.3) shows in a decode whose tokens fill no whole control steps.
     """
