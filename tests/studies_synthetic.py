@@ -124,7 +124,10 @@ def swept(
     study = plan_study(opened(results), study, rerun, runtime=runtime, command=command)
     prepare = prepare or episodes_of
     total = len(study.to_run)
-    with Run(study.database, study.kind, study.name, command, total, alone=False) as record, pretending(prepare):
+    # variables of a process are set for its worker processes alone: two threads that sweep would restore each other's
+    in_others = study.runtime.workers > 1 or study.runtime.executor != "local"
+    pretended = pretending(prepare) if in_others else contextlib.nullcontext()
+    with Run(study.database, study.kind, study.name, command, total, alone=False) as record, pretended:
         return study, run_blocks(study, prepare, record, on_event)
 
 

@@ -172,8 +172,9 @@ def run_blocks(study: Study, prepare: Prepare, record: Run, on_event: OnEvent) -
         on_event: Called with each event, to show progress.
     """
     runtime, blocks = study.runtime, study.blocks
-    queue, progress = Queue(study, record.id), Progress(study, record, on_event)
+    queue = Queue(study, record.id)
     queue.fill()
+    progress = Progress(study, record, on_event)
     threads = max((one.setting.settings["runtime"]["threads"] for one in study.to_run), default=1)
     try:
         if blocks and runtime.executor == SLURM:
