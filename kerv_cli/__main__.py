@@ -4,6 +4,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from types import FrameType
 
 
@@ -30,12 +31,23 @@ def _end(number: int, frame: FrameType | None) -> None:
 _UNSAFE = ("<frozen importlib", f"{os.sep}sqlalchemy{os.sep}pool{os.sep}")
 """Code in files with these parts in their names must not be interrupted. An exception during an import can abort the
 process, if C++ code is running Python. SQLAlchemy's pool prints the traceback of an exception that interrupts it."""
+_WAIT_SECONDS = 3.0
+"""Longest wait for the end of such code. Some takes much longer: the import that compiles for this CPU."""
+_asked: list[float] = []
+"""Times at which a signal came while such code ran, seconds."""
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt. If the running code must not be interrupted, send the signal again a little later."""
+    """Raise KeyboardInterrupt. If the running code must not be interrupted, send the signal again a little later.
+
+    If that code goes on for too long, end the process at once. The database shows its command as interrupted then.
+    """
+    now = time.monotonic()
     while frame is not None:
         if any(part in frame.f_code.co_filename for part in _UNSAFE):
+            _asked.append(now)
+            if now - _asked[0] > _WAIT_SECONDS:
+                _end(number, frame)
             _ask_again(number)
             return
         frame = frame.f_back

@@ -130,3 +130,17 @@ def test_an_interrupt_waits_for_code_that_cannot_raise(library, number, tmp_path
         preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),
     )  # fmt: skip
     assert (run.returncode, run.stdout) == (0, "loaded\ncleared\n"), run.stderr
+
+
+def test_an_import_that_takes_long_is_ended(tmp_path):
+    (tmp_path / "library.py").write_text("import time\nprint('begun', flush=True)\ntime.sleep(60)\n")
+    begun = subprocess.Popen(
+        [sys.executable, "-c", COMMAND.replace("kerv.main", "kerv._WAIT_SECONDS = 0.2\nkerv.main")],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )  # fmt: skip
+    assert begun.stdout.readline() == "begun\n"
+    begun.send_signal(signal.SIGINT)
+    assert begun.communicate(timeout=20) == ("", "kerv: interrupted\n")
+    assert begun.returncode == 130
