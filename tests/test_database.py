@@ -28,7 +28,7 @@ from kerv_cli.catalogue.imports import import_databases
 from kerv_cli.episodes.rows import decodes_table, episode_row
 from kerv_cli.lab import database as module
 from kerv_cli.lab.command import STORE, noted
-from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, FILE, RUNS, STUDIES, WANTED, Database, opened
+from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, FILE, RUNS, STUDIES, WANTED, Database, Unanswered, opened
 from kerv_cli.lab.runs import Run, making, pulse, run_rows, time_left
 from kerv_cli.lab.store import Study, studies
 from kerv_cli.report.tables import load_study
@@ -248,6 +248,17 @@ def test_a_statement_that_takes_too_long_ends(database, monkeypatch):
         connection.execute(sa.text("SELECT pg_sleep(20)"))
     with refused("refused a statement", "check the rights", error=StorageError), database.reading() as connection:
         connection.execute(sa.text("SELECT * FROM nowhere"))
+
+
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
+def test_a_suspended_transaction_lets_others_write(database, monkeypatch):
+    monkeypatch.setattr("kerv_cli.lab.postgresql.IDLE_SECONDS", 1)
+    number = sa.select(sa.func.count()).select_from(RUNS)
+    with refused("failed", "check that the server runs", error=Unanswered), database.writing() as suspended:
+        suspended.execute(sa.text("LOCK TABLE runs"))
+        with Database(database.results, database.store).writing() as other:
+            assert other.scalar(number) == 0  # it waits until the first has lost its lock
+        suspended.scalar(number)
 
 
 @pytest.mark.parametrize("version", ["'x'", "''", "-1", "0", "'1.5'", "x'31'", "'٣'", "99999999999999999999"])

@@ -350,7 +350,7 @@ class Database:
     def _explained(self, error: sa.exc.DBAPIError) -> KervError:
         why = " ".join(str(error.orig).split())[:160]
         if self.file is None:
-            is_away = isinstance(error, sa.exc.OperationalError | sa.exc.InterfaceError)
+            is_away = isinstance(error, sa.exc.OperationalError | sa.exc.InterfaceError) or error.connection_invalidated
             hint = "check that the server runs, or leave out store=" if is_away else "check the rights of its user"
             kind = Unanswered if is_away else StorageError
             return kind(f"store={self.shown} {'failed' if is_away else 'refused a statement'} ({why}): {hint}")

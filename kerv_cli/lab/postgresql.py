@@ -10,6 +10,8 @@ import psycopg
 
 STATEMENT_SECONDS = 30
 """Longest time that a statement may take, waiting for other transactions included, seconds."""
+IDLE_SECONDS = 20
+"""Longest time between two statements of a transaction, seconds. It holds locks for which other workers wait."""
 CONNECT_SECONDS = 5
 """Longest time to wait for a connection, seconds."""
 _SPARE_SECONDS = 5
@@ -52,5 +54,5 @@ def _limited(gen: Any, seconds: float) -> Generator[Any, Any, Any]:
 
 def connect(dialect: object, record: object, arguments: Sequence[Any], options: dict[str, Any]) -> Connection:
     """Return a new connection, for SQLAlchemy's event `do_connect`."""
-    limits = {"connect_timeout": CONNECT_SECONDS, "options": f"-c statement_timeout={STATEMENT_SECONDS}s"}
-    return Connection.connect(*arguments, **{**options, **limits})
+    limits = f"-c statement_timeout={STATEMENT_SECONDS}s -c idle_in_transaction_session_timeout={IDLE_SECONDS}s"
+    return Connection.connect(*arguments, **{**options, "connect_timeout": CONNECT_SECONDS, "options": limits})
