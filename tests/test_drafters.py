@@ -17,12 +17,13 @@ from kerv_cli.methods.artifacts import MadeFor
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early import EarlySettings
-from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyExamples, EarlyNetwork, choose
+from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyExamples, EarlyNetwork, choose, measure
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.compilable import compile_parts
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.targets.losses import soft_labels, token_loss, within_chunk
 from kerv_cli.targets.observations import split
 from kerv_cli.training.imitation import load_samples
 from kerv_cli.training.settings import TrainDrafterSettings
@@ -239,6 +240,23 @@ def test_the_teachers_tokens_are_the_targets_own_decodes(demonstrated, name):
     assert torch.equal(held.episodes, unseen.episodes)
     few = examples_of(target, dataset, dataclasses.replace(SMALL, samples=12))
     assert 12 <= sum(map(len, few)) <= 18
+
+
+def test_tokens_after_the_end_of_a_chunk_are_not_counted():
+    """Chunks of a code differ in length: in training and in its figures, what is drafted after the end is nothing."""
+    end, zeros = 6, torch.zeros(3, dtype=torch.long)
+    tokens = torch.tensor([[1, 2, end, end, end], [end] * 5, [1, 2, 3, 4, end]])
+    few = EarlyExamples(tokens, zeros, zeros.bool(), torch.zeros(3, 1))
+    logits = torch.randn(3, 5, end + 1, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    within = within_chunk(tokens, end)
+    assert within.sum(1).tolist() == [3, 1, 5]
+    token_loss(logits, tokens, soft_labels(end + 1, 0.0), within).backward()
+    assert torch.equal(logits.grad.abs().sum(-1) > 0, within)
+    drafts = torch.tensor([[1, 2, end, 0, 0], [end, 1, 1, 1, 1], [1, 2, 0, 4, end]])
+    found = measure(torch.nn.functional.one_hot(drafts, end + 1) * 9.0, few, torch.ones(5).bool(), end)
+    assert found["accepted_strict"] == pytest.approx((3 + 1 + 2) / 3)
+    assert found["whole_strict"] == pytest.approx(2 / 3)
+    assert found["token_accuracy"] == pytest.approx((1 + 1 + 4 / 5) / 3)
 
 
 def test_a_single_episode_cannot_be_held_out():

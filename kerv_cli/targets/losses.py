@@ -35,15 +35,28 @@ def labels_of(actions: ActionSpace, sigma: float) -> Tensor:
     return soft_labels(actions.tokens, sigma if actions.code is None else 0.0)
 
 
-def token_loss(logits: Tensor, tokens: Tensor, labels: Tensor) -> Tensor:
+def token_loss(logits: Tensor, tokens: Tensor, labels: Tensor, counted: Tensor | None = None) -> Tensor:
     """Return the mean cross-entropy between predictions and soft labels.
 
     Args:
         logits: (B, N, V) predictions.
         tokens: (B, N) true tokens.
         labels: (V, V) result of `soft_labels`.
+        counted: (B, N) bool, the tokens to average over. None: all.
     """
-    return -(labels[tokens] * F.log_softmax(logits.float(), -1)).sum(-1).mean()
+    losses = -(labels[tokens] * F.log_softmax(logits.float(), -1)).sum(-1)
+    return losses.mean() if counted is None else losses[counted].mean()
+
+
+def within_chunk(tokens: Tensor, end: int | None) -> Tensor:
+    """Return (B, N) bool: which of these tokens belong to their chunk. Those after its end token do not.
+
+    Args:
+        tokens: (B, N) tokens.
+        end: The token that ends a chunk, which belongs to it. None: all tokens do.
+    """
+    ends = tokens == (-1 if end is None else end)
+    return ends.cumsum(1) - ends.long() == 0
 
 
 def position_loss(estimated: Tensor, places: Tensor) -> Tensor:

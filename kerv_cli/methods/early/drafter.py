@@ -30,7 +30,7 @@ from kerv_cli.methods.drafters import Decodes, Metrics, TrainableDrafter
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.targets.compact.compilable import FORMATS, Compilable
 from kerv_cli.targets.compact.program import Program
-from kerv_cli.targets.losses import labels_of, token_loss
+from kerv_cli.targets.losses import labels_of, token_loss, within_chunk
 from kerv_cli.targets.observations import observations_of, prompts_of
 from kerv_cli.worlds.demos.files import DemoEpisode
 
@@ -265,6 +265,8 @@ class EarlyDrafter(TrainableDrafter):
     def token_loss(self, logits: Tensor, target: Any, batch: Decodes, settings: Any) -> Tensor:
         """Return the cross-entropy of logits with soft labels, which spread each target token over neighbouring bins.
 
+        Tokens after the end of a chunk are not counted.
+
         Args:
             logits: (B, N, V).
             target: The target.
@@ -272,7 +274,9 @@ class EarlyDrafter(TrainableDrafter):
             settings: Settings of `kerv train drafter`.
         """
         labels = _labels(target.actions, settings.train.label_sigma, target.device)
-        return token_loss(logits, batch.tokens.to(target.device), labels)
+        tokens = batch.tokens.to(target.device)
+        end = target.actions.end
+        return token_loss(logits, tokens, labels, None if end is None else within_chunk(tokens, end))
 
     def loss(self, network: Any, target: Any, batch: Any, step: int, settings: Any) -> tuple[Tensor, Metrics]:
         """Return the token loss of a batch, and metrics to log."""
@@ -287,7 +291,8 @@ class EarlyDrafter(TrainableDrafter):
         chosen = torch.arange(len(held_out)).split(256)
         outputs = [self.outputs(network, target, held_out.where(indices)) for indices in chosen]
         logits, *rest = (torch.cat(parts).cpu() for parts in zip(*outputs, strict=True))
-        metrics = measure(logits, held_out, torch.from_numpy(target.actions.strict_tokens(logits.shape[1])))
+        strict = torch.from_numpy(target.actions.strict_tokens(logits.shape[1]))
+        metrics = measure(logits, held_out, strict, target.actions.end)
         score = metrics["accepted_r9"] + metrics["accepted_strict"]
         return {"score": score, **metrics, **self.further_metrics(target, held_out, *rest)}
 
@@ -301,7 +306,7 @@ def _labels(actions: ActionSpace, sigma: float, device: torch.device) -> Tensor:
     return labels_of(actions, sigma).to(device)
 
 
-def measure(logits: Tensor, examples: Decodes, strict: Tensor) -> Metrics:
+def measure(logits: Tensor, examples: Decodes, strict: Tensor, end: int | None = None) -> Metrics:
     """Estimate how many draft tokens would be accepted, at the acceptance radii 0, 3 and 9.
 
     A draft is accepted up to its first token that is not within the radius of the target's greedy token. This
@@ -311,6 +316,7 @@ def measure(logits: Tensor, examples: Decodes, strict: Tensor) -> Metrics:
         logits: (n, N, V) of the drafter.
         examples: The target's greedy decodes of the same n observations.
         strict: (N,) bool, tokens that must equal the target's.
+        end: The token that ends a chunk. Tokens after it are not counted. None: chunks have no such token.
 
     Returns:
         For each radius the mean number of accepted tokens and the share of drafts that are accepted whole. Also the
@@ -322,10 +328,13 @@ def measure(logits: Tensor, examples: Decodes, strict: Tensor) -> Metrics:
         return float(torch.stack([values.float()[mask].mean() for mask in kinds]).mean())
 
     metrics: Metrics = {}
+    counted = within_chunk(examples.tokens, end)
+    sizes = counted.sum(1)
     for name, r in {"strict": 0, "r3": 3, "r9": 9}.items():
         right = (choose(logits, r, strict)[0] - examples.tokens).abs() <= torch.where(strict, 0, r)
-        accepted = right.long().cumprod(1).sum(1)
+        accepted = (right & counted).long().cumprod(1).sum(1)
         metrics[f"accepted_{name}"] = balanced(accepted)
-        metrics[f"whole_{name}"] = balanced(accepted == logits.shape[1])
-    metrics["token_accuracy"] = balanced((logits.argmax(-1) == examples.tokens).float().mean(1))
+        metrics[f"whole_{name}"] = balanced(accepted == sizes)
+    right = (logits.argmax(-1) == examples.tokens) & counted
+    metrics["token_accuracy"] = balanced(right.sum(1) / sizes)
     return metrics
