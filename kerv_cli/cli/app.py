@@ -12,7 +12,7 @@ import typer
 from typer.core import TyperGroup
 
 from kerv_cli.base.errors import UnknownName
-from kerv_cli.cli.command import CONTEXT, FastFlags, commands, summary_of, typer_command
+from kerv_cli.cli.command import CONTEXT, FastFlags, commands, typer_command
 from kerv_cli.cli.common import one_line_errors
 
 # Set before numpy loads: by default its matrix multiplications use every core, whatever runtime.threads says.
@@ -43,7 +43,8 @@ class Commands(FastFlags, TyperGroup):
             return typer_command(below[name])
         if not any(one.startswith(f"{name} ") for one in below):
             return None
-        family = Commands(name=cmd_name, help=FAMILIES.get(name), no_args_is_help=True, rich_markup_mode=None)
+        help = FAMILIES.get(name)
+        family = Commands(name=cmd_name, help=help, short_help=help, no_args_is_help=True, rich_markup_mode=None)
         family.context_settings, family.prefix = CONTEXT, f"{name} "
         return family
 
@@ -61,15 +62,6 @@ class Commands(FastFlags, TyperGroup):
         if command is None and not ctx.resilient_parsing:
             raise UnknownName(f"{self.prefix}command", args[0], self.list_commands(ctx))
         return args[0], command, args[1:]
-
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the list of commands to the help."""
-        known, rows = commands(self.prefix.strip()), []
-        for word in self.list_commands(ctx):
-            name = self.prefix + word
-            rows.append((word, summary_of(known[name]) if name in known else FAMILIES.get(name, "")))
-        with formatter.section("Commands"):
-            formatter.write_dl(rows)
 
 
 class Kerv(Commands):

@@ -18,7 +18,6 @@ AsJson = Annotated[bool, typer.Option("--json", help="Also print the whole resul
     "bench",
     BenchSettings,
     keys="target dtype tokens repeats projected runtime.device runtime.dtype runtime.threads results",
-    examples=("kerv bench target=vla-150m", "kerv bench projected=openvla-7b"),
     typed={"target": "model"},  # renamed, because Hydra would take target= as a choice among the files of conf/target
 )
 def bench(settings: BenchSettings, as_json: AsJson = False) -> None:
@@ -27,6 +26,10 @@ def bench(settings: BenchSettings, as_json: AsJson = False) -> None:
     target= is a policy, or a shape with random weights: vla-150m, smolvla, openvla-7b. 'kerv report study=NAME
     on=PROFILE' estimates from the profile how long a study's decodes would take. projected=openvla-7b computes profiles
     for GPUs that are not here.
+
+    Examples:
+        kerv bench target=vla-150m
+        kerv bench projected=openvla-7b
     """
     if settings.projected != "none":
         _project(settings, as_json)

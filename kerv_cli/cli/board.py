@@ -26,15 +26,14 @@ class BoardSettings(CommandSettings):
     open: bool = setting(True, "open the page in the browser")
 
 
-@command(
-    "board",
-    BoardSettings,
-    keys="port open results",
-    examples=("kerv board", "kerv board port=0 open=false"),
-    writes=False,
-)
+@command("board", BoardSettings, keys="port open results", writes=False)
 def board(settings: BoardSettings) -> None:
-    """Look at runs, studies, trainings and episodes in the browser, until Ctrl-C; only this machine can."""
+    """Look at runs, studies, trainings and episodes in the browser, until Ctrl-C; only this machine can.
+
+    Examples:
+        kerv board
+        kerv board port=0 open=false
+    """
     from kerv_cli.board.app import serve
     from kerv_cli.report.viewing.viewer import has_display
 
@@ -50,12 +49,15 @@ def board(settings: BoardSettings) -> None:
 @command(
     "board export",
     names="NAME: a folder to write to, then runs (id, or a unique part of it; none: all), and results=DIR.",
-    keys="results",
-    examples=("kerv board export shared", "kerv board export shared papers"),
     writes=False,
 )
 def export(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
-    """Write the board as files: tables, plots, films, tokens. They open without a server and can be sent."""
+    """Write the board as files: tables, plots, films, tokens. They open without a server and can be sent.
+
+    Examples:
+        kerv board export shared
+        kerv board export shared papers
+    """
     from kerv_cli.base.files import write_folder
     from kerv_cli.board.export import export_board
     from kerv_cli.catalogue.entries import disk_bytes, find_run

@@ -15,15 +15,16 @@ from kerv_cli.training.settings import BuildDatastoreSettings, BuildDrafterSetti
     "build target",
     BuildTargetSettings,
     keys="grow policy.target target checkpoint name statistics environment check results",
-    examples=(
-        "kerv build target grow=150m policy.target=mt10-vision name=mt10-150m",
-        "kerv build target checkpoint=models/libero name=libero statistics=libero_spatial crop=true",
-    ),
     # renamed, because Hydra would take target= as a choice among the files of conf/target
     typed={"target": "family", "policy.target": "base"},
 )
 def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
-    """Make a target from a published checkpoint, which is not copied, or from a policy by enlarging its trunk."""
+    """Make a target from a published checkpoint, which is not copied, or from a policy by enlarging its trunk.
+
+    Examples:
+        kerv build target grow=150m policy.target=mt10-vision name=mt10-150m
+        kerv build target checkpoint=models/libero name=libero statistics=libero_spatial crop=true
+    """
     if settings.grow.width:
         settings.family = "grown"
     importer = TargetPart.find(settings.family, "target family").importer
@@ -37,17 +38,14 @@ def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
     print_figures("target", figures, folder, as_json)
 
 
-@command(
-    "build drafter",
-    BuildDrafterSettings,
-    keys="checkpoint policy.target policy.artifacts positions mask results",
-    examples=(
-        "kerv build drafter checkpoint=models/eagle policy.target=openvla",
-        "kerv build drafter checkpoint=models/eagle policy.target=openvla policy.artifacts.drafter=public mask=prompt",
-    ),
-)
+@command("build drafter", BuildDrafterSettings, keys="checkpoint policy.target policy.artifacts positions mask results")
 def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
-    """Import a drafter in the public EAGLE or Spec-VLA layout for a target."""
+    """Import a drafter in the public EAGLE or Spec-VLA layout for a target.
+
+    Examples:
+        kerv build drafter checkpoint=models/eagle policy.target=openvla
+        kerv build drafter checkpoint=models/eagle policy.target=openvla policy.artifacts.drafter=public mask=prompt
+    """
     if not settings.checkpoint:
         raise UsageError("checkpoint=DIR: name the folder of a drafter (config.json, model.safetensors)")
     from kerv_cli.lab.runs import making
@@ -64,13 +62,14 @@ def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
     "build datastore",
     BuildDatastoreSettings,
     keys="policy.target policy.artifacts demos task episodes key components half",
-    examples=(
-        "kerv build datastore demos=mt10 policy.artifacts.datastore=mine",
-        "kerv build datastore policy.target=mine demos=mine half=true --plan",
-    ),
 )
 def datastore(settings: BuildDatastoreSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
-    """Store the demonstrations' action chunks with the target's features as search keys, for drafts by retrieval."""
+    """Store the demonstrations' action chunks with the target's features as search keys, for drafts by retrieval.
+
+    Examples:
+        kerv build datastore demos=mt10 policy.artifacts.datastore=mine
+        kerv build datastore policy.target=mine demos=mine half=true --plan
+    """
     from kerv_cli.training.datastore import build_datastore
 
     with as_planned(settings, plan, as_json) as (database, begin):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from kerv_cli.base.config import compose
-from kerv_cli.cli.command import command
+from kerv_cli.cli.command import Cfg, command
 from kerv_cli.cli.common import AsJson, ShowPlan, as_planned, end_with_json, print_rows, print_table, settings_yaml
 from kerv_cli.episodes.settings import SweepSettings
 from kerv_cli.training.settings import CalibrateSettings, CalibrateSuccessSettings
@@ -23,13 +23,14 @@ if TYPE_CHECKING:
     "calibrate",
     CalibrateSettings,
     keys="policy.target demos task policy.artifacts episodes decodes window boundary_windows epsilon",
-    examples=(
-        "kerv calibrate demos=mt10 policy.artifacts.calibration=mine",
-        "kerv calibrate policy.target=mine demos=mine decodes=20 --plan",
-    ),
 )
 def constants(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
-    """Fit the constants of KERV and HeiSD: predictors, variability per task, boundary ranges and skip levels."""
+    """Fit the constants of KERV and HeiSD: predictors, variability per task, boundary ranges and skip levels.
+
+    Examples:
+        kerv calibrate demos=mt10 policy.artifacts.calibration=mine
+        kerv calibrate policy.target=mine demos=mine decodes=20 --plan
+    """
     from kerv_cli.training.calibration import calibrate
 
     with as_planned(settings, plan) as (database, begin):
@@ -83,16 +84,16 @@ OF_TEST = {at.name for at in fields(CalibrateSuccessSettings)} - {at.name for at
     "calibrate success",
     CalibrateSuccessSettings,
     keys="study margin delta task episodes policy.target policy.artifacts runtime.workers results",
-    examples=(
-        "kerv calibrate success policy.target=mine",
-        "kerv calibrate success policy.artifacts.certificate=mine margin=3 episodes=50 seed=50600 again=true --plan",
-    ),
     each="rollout",
 )
-def success(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:
+def success(overrides: list[str], cfg: Cfg = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Run a study's settings on seeds of their own, the most cautious first, and certify which keep AR's success.
 
     Existing episodes are reused. Choose the number of episodes before you look at any result.
+
+    Examples:
+        kerv calibrate success policy.target=mine
+        kerv calibrate success policy.artifacts.certificate=mine margin=3 episodes=50 seed=50600 again=true --plan
     """
     from kerv_cli.cli.studies import planned_study, print_settings, print_study_plan, run_study
     from kerv_cli.episodes.resolve import resolve

@@ -1,23 +1,20 @@
 """Declare the commands of `kerv`: the decorator `command` turns a function into the command of that name.
 
 The decorator puts the function into kerv's registry. From that entry (a `Part` of kind `command`) this module makes
-typer's command with its options, settings, help and completion. The function can have these parameters:
+typer's command with its options, settings, help and completion. The function is one of typer's: each parameter with a
+default is an option. Parameters without a default are arguments, and these are known:
 
-- `settings`: The command's settings, composed and checked.
+- `settings`: The command's settings, composed and checked. The command then has the option --cfg.
 - `overrides`: The `key=value` arguments as typed.
 - `names`: All other arguments, such as names of runs.
-- `cfg`: Whether --cfg was typed. Only for a command that prints its settings itself.
-
-Every other parameter is an option of the command in typer's notation.
 """
 
 from __future__ import annotations
 
 import functools
 import inspect
-import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -32,16 +29,18 @@ from kerv_cli.base.registry import MODULES, NoSettings, Part, parts
 from kerv_cli.base.settings import CommandSettings, choices_of
 from kerv_cli.cli.common import settings_yaml
 
+CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 120}
+Cfg = Annotated[bool, typer.Option("--cfg", help="Print the resolved settings and stop.")]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Command(Part):
-    """A command `kerv NAME`. Its function's docstring becomes the help.
+    """A command `kerv NAME`. Its function's docstring becomes the help, with the section `Examples:` at its end.
 
     Args:
         name: Name of the command, such as `train target`.
         settings: Dataclass of its settings. NoSettings if it has none.
         keys: Names of the settings that `--help` lists, separated by spaces.
-        examples: Command lines for the help.
         names: Help text for arguments that are not `key=value`. Empty: there are none.
         typed: Maps a key as typed on the command line to the name of the setting, if the two differ.
         writes: Whether the command writes to the results folder. If so, kerv first checks that the folder is writable.
@@ -50,8 +49,7 @@ class Command(Part):
 
     kind = "command"
     settings: type = field(default=CommandSettings, kw_only=False)
-    keys: str = ""
-    examples: tuple[str, ...] = ()
+    keys: str = "results"
     names: str = ""
     typed: Mapping[str, str] = field(default_factory=dict)
     writes: bool = True
@@ -59,8 +57,19 @@ class Command(Part):
 
     @property
     def help(self) -> str:
-        """The docstring of the command's function."""
-        return inspect.cleandoc(self.code.__doc__ or "")
+        """The docstring of the command's function, up to its examples."""
+        return inspect.cleandoc(self.code.__doc__ or "").partition("\n\nExamples:\n")[0]
+
+    @property
+    def examples(self) -> list[str]:
+        """Command lines for the help."""
+        lines = inspect.cleandoc(self.code.__doc__ or "").partition("\n\nExamples:\n")[2].splitlines()
+        return list(map(str.strip, lines))
+
+    @property
+    def summary(self) -> str:
+        """The first sentence of the help, or its part before a semicolon."""
+        return re.split(r"[.;]\s", self.help + " ")[0]
 
     @property
     def shown(self) -> list[str]:
@@ -89,12 +98,10 @@ def top_keys(part: Command) -> list[str]:
     """Return the names that an override of this command can begin with: `threshold` for `threshold.r=5`."""
     if part.settings is NoSettings:
         return []
-    schemas = schemas_of(part)
-    groups, names = map(choices_of, schemas), map(fields_of, schemas)
-    keys = dict.fromkeys(itertools.chain(part.typed, *groups, *names))
-    for hidden in part.typed.values():
-        keys.pop(hidden, None)
-    return list(keys)
+    keys = list(part.typed)
+    for schema in schemas_of(part):
+        keys += [*choices_of(schema), *fields_of(schema)]
+    return [key for key in dict.fromkeys(keys) if key not in part.typed.values()]
 
 
 def commands(words: str = "") -> dict[str, Command]:
@@ -107,51 +114,32 @@ def commands(words: str = "") -> dict[str, Command]:
     """
     files, file = MODULES["command"], f"kerv_cli.cli.{words.partition(' ')[0]}"
     found = parts("command", file if file in files else "")
-    places = dict(zip(files, range(len(files)), strict=True))
-    names = sorted(found, key=lambda name: places.get(found[name].module, len(files)))  # plugins last
-    return {name: cast(Command, found[name]) for name in names if f"{name} ".startswith(f"{words} ".lstrip())}
+    chosen = [cast(Command, part) for name, part in found.items() if f"{name} ".startswith(f"{words} ".lstrip())]
+    chosen.sort(key=lambda part: [*files, part.module].index(part.module))  # plugins last
+    return {part.name: part for part in chosen}
 
 
 def typer_command(part: Command) -> TyperCommand:
-    """Make a typer command from a registered command."""
-    parameters = inspect.signature(part.code, eval_str=True).parameters
-    options = [one.replace(kind=one.KEYWORD_ONLY) for name, one in parameters.items() if name not in _ARGUMENTS]
-    if part.settings is not NoSettings:
-        options.insert(0, inspect.Parameter("cfg", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=_CFG))
-
-    def declared() -> None:
-        """Only its signature is read: `CommandWithSettings.invoke` calls the command's function."""
-
-    declared.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
-    single = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+    """Make a typer command from a registered command. `CommandWithSettings.invoke` fills in its arguments."""
     help = "\n\n".join(filter(None, (part.help, part.names)))
-    words = {**CONTEXT, "allow_extra_args": True}  # typer's own argument for them would import pydantic
-    single.command(part.name, cls=CommandWithSettings, help=help, context_settings=words)(declared)
-    made: Any = typer.main.get_command(single)
-    made.part = part
-    return made
+    words = {**CONTEXT, "allow_extra_args": True}  # if typer parsed the arguments, it would import pydantic
+    made = _made(part.code, name=part.name, cls=CommandWithSettings, help=help, context_settings=words)
+    made.part, made.short_help = part, part.summary
+    made.arguments = [one.name for one in made.params if one.param_type_name == "argument"]
+    options = [one for one in made.params if one.param_type_name == "option"]
+    made.params = [*_made(_with_settings).params, *options] if "settings" in made.arguments else options
+    return cast(TyperCommand, made)
 
 
-def _flags(command: TyperCommand, options: Mapping[str, object]) -> list[str]:
-    """Return the options that were given, as they are typed: `--plan`, `--to`, `csv`.
-
-    Args:
-        command: The command.
-        options: The values of the options, by the name of the parameter.
-    """
-    names = {param.name: param.opts[0] for param in command.params}
-    words: list[str] = []
-    for name, value in options.items():
-        if value is True:
-            words.append(names[name])
-        elif value not in (None, False):
-            words += names[name], str(value)
-    return words
+def _made(code: Callable[..., None], **more: Any) -> Any:
+    """Return typer's command for a function."""
+    single = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+    single.command(**more)(code)
+    return typer.main.get_command(single)
 
 
-CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 120}
-_ARGUMENTS = ("settings", "overrides", "names", "cfg")
-_CFG = Annotated[bool, typer.Option("--cfg", help="Print the resolved settings and stop.")]
+def _with_settings(cfg: Cfg = False) -> None:
+    """Declare the option of every command with settings."""
 
 
 def complete(part: Command, typed: Sequence[str], incomplete: str) -> list[str]:
@@ -260,21 +248,25 @@ class CommandWithSettings(FastFlags, TyperCommand):
     """A typer command whose help also lists settings, subcommands and examples."""
 
     part: Command
+    arguments: list[str]
 
     def invoke(self, ctx: Any) -> None:
         """Run the command with the settings, names and options that were typed."""
         from kerv_cli.lab.command import chosen_store, noted
 
-        part, options = self.part, dict(ctx.params)
-        cfg, wanted = options.pop("cfg", False), inspect.signature(part.code).parameters
-        overrides, names = _split(part, ctx.args, "names" in wanted)
-        with chosen_store(overrides) as overrides:
-            arguments = {"overrides": overrides, "names": names, "cfg": cfg}
-            if "settings" in wanted or (cfg and "cfg" not in wanted):
-                arguments["settings"] = _settings(part, overrides, cfg)
-            given = {name: value for name, value in arguments.items() if name in wanted}
-            with noted([*part.name.split(), *overrides, *names, *_flags(self, options)]):
-                part.code(**given, **options)
+        part, options = self.part, ctx.params
+        with chosen_store(ctx.args) as words:
+            overrides, names = _split(part, words, "names" in self.arguments)
+            given: dict[str, Any] = {"overrides": overrides, "names": names}
+            if "settings" in self.arguments:
+                given["settings"] = _settings(part, overrides, options.pop("cfg"))
+            line = [*part.name.split(), *overrides, *names]
+            for option in self.params:
+                value = options.get(option.name)
+                if value not in (None, False):
+                    line += [option.opts[0]] if value is True else [option.opts[0], str(value)]
+            with noted(line):
+                part.code(**{name: given[name] for name in self.arguments}, **options)
 
     def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
         """Complete an option or an override."""
@@ -298,16 +290,11 @@ class CommandWithSettings(FastFlags, TyperCommand):
                 formatter.write_dl(keys)
         if below:
             with formatter.section("Commands"):
-                formatter.write_dl([(name, summary_of(part)) for name, part in below.items()])
+                formatter.write_dl([(name, part.summary) for name, part in below.items()])
         if self.part.examples:
             with formatter.section("Examples"):
                 for line in self.part.examples:
                     formatter.write(f"{'':{formatter.current_indent}}{line}\n")
-
-
-def summary_of(part: Command) -> str:
-    """Return the first sentence of a command's help, or its part before a semicolon."""
-    return re.split(r"[.;]\s", part.help + " ")[0]
 
 
 def _row(part: Command, key: str) -> tuple[str, str]:

@@ -24,11 +24,14 @@ RATES = (
 )
 
 
-@command(
-    "compare", NoSettings, names=COUNTS, examples=("kerv compare 17/20 14/20", "kerv compare 17/20 14/20 lost=4 won=1")
-)
+@command("compare", NoSettings, keys="", names=COUNTS)
 def compare(names: list[str], as_json: AsJson = False) -> None:
-    """Compare two success counts: the difference with its 95 % interval; no run is needed."""
+    """Compare two success counts: the difference with its 95 % interval; no run is needed.
+
+    Examples:
+        kerv compare 17/20 14/20
+        kerv compare 17/20 14/20 lost=4 won=1
+    """
     from kerv_cli.report.statistics import PairedCounts, difference, mcnemar, paired_difference, wilson
 
     words, given = _options(names)
@@ -64,9 +67,14 @@ def compare(names: list[str], as_json: AsJson = False) -> None:
         typer.echo(f"The second succeeds {way} often: the difference is between {low} and {high} points.")
 
 
-@command("power", NoSettings, names=RATES, examples=("kerv power 0.90 0.95", "kerv power 18/20 0.95 lost=0.02"))
+@command("power", NoSettings, keys="", names=RATES)
 def power(names: list[str], as_json: AsJson = False) -> None:
-    """Say how many pairs of episodes show a difference of success with a probability of 80 %."""
+    """Say how many pairs of episodes show a difference of success with a probability of 80 %.
+
+    Examples:
+        kerv power 0.90 0.95
+        kerv power 18/20 0.95 lost=0.02
+    """
     from kerv_cli.report.statistics import MOST_PAIRS, pairs_for_power
 
     words, given = _options(names)

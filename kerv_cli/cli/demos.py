@@ -14,15 +14,16 @@ from kerv_cli.worlds.settings import DemosImportSettings
 
 
 @command(
-    "demos",
-    DemosSettings,
-    keys="name task episodes seed perturbed policy world.camera.name runtime.workers results",
-    examples=("kerv demos name=mine task=MT10 episodes=100", "kerv demos name=visited policy=vision task=reach --plan"),
+    "demos", DemosSettings, keys="name task episodes seed perturbed policy world.camera.name runtime.workers results"
 )
 def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
     """Record successful episodes of the scripted experts, some of them disturbed, as a dataset.
 
     With policy=NAME a policy acts instead, and the expert labels the states that it reaches (DAgger).
+
+    Examples:
+        kerv demos name=mine task=MT10 episodes=100
+        kerv demos name=visited policy=vision task=reach --plan
     """
     from kerv_cli.training.dagger import recording_of
     from kerv_cli.training.demonstrations import name_of
@@ -45,17 +46,14 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
     print_table(("task", "episodes", "mean steps", "failed seeds"), rows, f"demonstrations in {folder}")
 
 
-@command(
-    "demos import",
-    DemosImportSettings,
-    keys="source name environment camera episodes dofs strict tail results",
-    examples=(
-        "kerv demos import source=datasets/aloha name=aloha",
-        "kerv demos import source=datasets/libero dofs=openvla episodes=50",
-    ),
-)
+@command("demos import", DemosImportSettings, keys="source name environment camera episodes dofs strict tail results")
 def import_demos(settings: DemosImportSettings) -> None:
-    """Read a LeRobot dataset as demonstrations."""
+    """Read a LeRobot dataset as demonstrations.
+
+    Examples:
+        kerv demos import source=datasets/aloha name=aloha
+        kerv demos import source=datasets/libero dofs=openvla episodes=50
+    """
     from kerv_cli.lab.runs import making
     from kerv_cli.worlds.demos.lerobot import import_lerobot
 

@@ -42,7 +42,6 @@ class DoctorSettings(RunSettings):
     "doctor",
     DoctorSettings,
     keys="target environment world.camera.size runtime.device runtime.threads results",
-    examples=("kerv doctor", "kerv doctor target=mt10-vision"),
     # renamed, because Hydra would take target= as a choice among the files of conf/target
     typed={"target": "policy.target"},
     writes=False,
@@ -51,6 +50,10 @@ def doctor(settings: DoctorSettings, as_json: AsJson = False) -> None:
     """Check rendering, simulator, torch, shipped policies, disk and display; say how to fix each problem.
 
     With target=NAME or environment=NAME check only whether that target or environment behaves as kerv requires.
+
+    Examples:
+        kerv doctor
+        kerv doctor target=mt10-vision
     """
     findings: list[Finding] = []
     if settings.policy.target:

@@ -18,11 +18,7 @@ if TYPE_CHECKING:
 
 
 @command(
-    "estimate",
-    EstimateSettings,
-    keys="weights model tokens prompt vision hz device on trace choose",
-    examples=("kerv estimate weights=7B tokens=7 device=h100", "kerv estimate trace=FILE on=PROFILE"),
-    writes=False,
+    "estimate", EstimateSettings, keys="weights model tokens prompt vision hz device on trace choose", writes=False
 )
 def estimate(settings: EstimateSettings, as_json: AsJson = False) -> None:
     """Say whether speculative decoding can help a policy: costs of an action, and speeds that methods can reach.
@@ -30,6 +26,10 @@ def estimate(settings: EstimateSettings, as_json: AsJson = False) -> None:
     weights=7B describes a policy by its size; model= reads a config.json or a target. A policy without action tokens
     has tokens=0. on=PROFILE takes measured costs. trace=FILE prices recorded decodes; choose=draft says which length of
     chains is the fastest for them.
+
+    Examples:
+        kerv estimate weights=7B tokens=7 device=h100
+        kerv estimate trace=FILE on=PROFILE
     """
     from kerv_cli.bench.described import described
     from kerv_cli.bench.prices import NO_TOKENS, Estimate

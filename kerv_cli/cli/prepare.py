@@ -20,13 +20,16 @@ NOT_OF_STEPS = ("for", "steps", "quick")
     "prepare",
     PrepareSettings,
     keys="policy.target for demos task quick steps runtime.device results",
-    examples=("kerv prepare policy.target=mine", "kerv prepare policy.target=mine quick=true --plan"),
     typed={"for": "methods"},
 )
 def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = False) -> None:
     """Make all artifacts of a target that methods need, in order: drafters, datastore, calibration, certificate.
 
     Existing artifacts are skipped. The same command continues after an interruption.
+
+    Examples:
+        kerv prepare policy.target=mine
+        kerv prepare policy.target=mine quick=true --plan
     """
     from kerv_cli.lab.runs import time_of
     from kerv_cli.training.preparation import THERE

@@ -52,7 +52,6 @@ AllColumns = Annotated[bool, typer.Option("--all", help="Print all columns of th
     "report",
     ReportSettings,
     keys="study results on baseline loss",
-    examples=("kerv report study=demo", "kerv report --choose study=threshold loss=5"),
     # renamed, because Hydra would take study= as a choice among the files of conf/study
     typed={"study": "only"},
 )
@@ -64,7 +63,12 @@ def report(
     explain: Explain = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write CSV tables (per task and aggregated), plots and an HTML page about the studies."""
+    """Write CSV tables (per task and aggregated), plots and an HTML page about the studies.
+
+    Examples:
+        kerv report study=demo
+        kerv report --choose study=threshold loss=5
+    """
     from kerv_cli.cli.studies import print_prices, print_study, print_verdict
     from kerv_cli.episodes.resolve import study_name
     from kerv_cli.lab.database import opened

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from kerv_cli.base.durations import about, count
-from kerv_cli.cli.command import command
+from kerv_cli.cli.command import Cfg, command
 from kerv_cli.cli.common import (
     AsJson,
     ShowPlan,
@@ -34,15 +34,16 @@ Many = Annotated[
     "rollout",
     RolloutSettings,
     keys="task method policy episodes seed proposer threshold record rollout.clock world.stress.kind",
-    examples=(
-        "kerv rollout method=spec_vla task=drawer-open threshold.r=5",
-        "kerv rollout -m method=ar,one_pass task=[reach,push] episodes=5",
-    ),
 )
 def rollout(
-    overrides: list[str], cfg: bool = False, plan: ShowPlan = False, multirun: Many = False, as_json: AsJson = False
+    overrides: list[str], cfg: Cfg = False, plan: ShowPlan = False, multirun: Many = False, as_json: AsJson = False
 ) -> None:
-    """Run episodes of one method; print success, forwards, acceptance and time; record one episode per task."""
+    """Run episodes of one method; print success, forwards, acceptance and time; record one episode per task.
+
+    Examples:
+        kerv rollout method=spec_vla task=drawer-open threshold.r=5
+        kerv rollout -m method=ar,one_pass task=[reach,push] episodes=5
+    """
     from kerv_cli.episodes.identity import stress_text
     from kerv_cli.episodes.resolve import resolve_rollout
 

@@ -16,7 +16,7 @@ from kerv_cli.base.errors import Interrupted, KervError, UsageError
 from kerv_cli.base.limits import setting
 from kerv_cli.base.paths import as_path
 from kerv_cli.base.settings import CommandSettings
-from kerv_cli.cli.command import Command, command
+from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
     AsJson,
     ShowPlan,
@@ -45,11 +45,6 @@ To = Annotated[str, typer.Option("--to", help="csv, parquet, db or trace.")]
 Folder = Annotated[Path | None, typer.Option("--dir", help="Folder to write to; default results/exports/FORMAT.")]
 
 
-def _command_on_runs(name: str, *examples: str) -> Command:
-    """Decorate a function to make it the command `kerv runs NAME`, whose arguments are names of runs."""
-    return command(f"runs {name}", names=RUNS, keys="results", examples=examples, writes=name in ("rerun", "rm"))
-
-
 def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a run") -> list[str]:
     """Return the names of runs that were typed. The path of a study's file becomes the name of the study.
 
@@ -69,15 +64,14 @@ def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a r
     return [study_name(name.removeprefix("study=")) for name in names]
 
 
-@command(
-    "runs list",
-    names=FILTERS,
-    keys="results",
-    examples=("kerv runs list", "kerv runs list kind=rollout method=ar"),
-    writes=False,
-)
+@command("runs list", names=FILTERS, writes=False)
 def list_(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
-    """List the runs of a results folder, the newest first."""
+    """List the runs of a results folder, the newest first.
+
+    Examples:
+        kerv runs list
+        kerv runs list kind=rollout method=ar
+    """
     from kerv_cli.catalogue.entries import few, find_runs, matching
 
     filters = dict(word.partition("=")[::2] for word in names)
@@ -99,9 +93,14 @@ def _entry_row(run: RunEntry) -> dict[str, object]:
     return {**asdict(run), "command": ["kerv", *run.command] if run.command else []}
 
 
-@_command_on_runs("show", "kerv runs show last", "kerv runs show main --json")
+@command("runs show", names=RUNS, writes=False)
 def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
-    """Show one run, ID or ID:SETTING: its command, its results, the artifacts it was made from, its folder."""
+    """Show one run, ID or ID:SETTING: its command, its results, the artifacts it was made from, its folder.
+
+    Examples:
+        kerv runs show last
+        kerv runs show main --json
+    """
     from kerv_cli.catalogue.entries import disk_bytes, find_runs, parents, store_of
     from kerv_cli.report.compare import compared_runs
     from kerv_cli.report.summary import SummaryTable
@@ -130,14 +129,14 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
         print_table(("measure", "value"), ((name, f"{value:.4g}") for name, value in run.figures.items()))
 
 
-@command(
-    "runs label",
-    names=WORDS,
-    keys="results",
-    examples=("kerv runs label last tag=baseline", 'kerv runs label main tag=paper,final note="figure 3"'),
-)
+@command("runs label", names=WORDS)
 def label(settings: CommandSettings, names: list[str]) -> None:
-    """Write tags and a note to a run. `kerv runs list tag=…`, the board and exports show them."""
+    """Write tags and a note to a run. `kerv runs list tag=…`, the board and exports show them.
+
+    Examples:
+        kerv runs label last tag=baseline
+        kerv runs label main tag=paper,final note="figure 3"
+    """
     from kerv_cli.catalogue.entries import LABELS, find_run, set_labels
 
     changes: dict[str, str] = {}
@@ -160,12 +159,15 @@ def label(settings: CommandSettings, names: list[str]) -> None:
 @command(
     "runs watch",
     names="NAME: a run (id, or a unique part of it) and results=DIR. Without a name: all that run.",
-    keys="results",
-    examples=("kerv runs watch", "kerv runs watch main"),
     writes=False,
 )
 def watch(settings: CommandSettings, names: list[str]) -> None:
-    """Follow what runs, from any terminal, until it ends: how far it is, and how long it takes."""
+    """Follow what runs, from any terminal, until it ends: how far it is, and how long it takes.
+
+    Examples:
+        kerv runs watch
+        kerv runs watch main
+    """
     from kerv_cli.catalogue.entries import find_run, find_runs
     from kerv_cli.lab.runs import BEAT_SECONDS
 
@@ -187,9 +189,14 @@ def watch(settings: CommandSettings, names: list[str]) -> None:
         typer.echo(f"{chosen} does not run: {runs[chosen].state}" if chosen else f"nothing runs in {settings.results}")
 
 
-@_command_on_runs("compare", "kerv runs compare main:ar main:kerv", "kerv runs compare main last")
+@command("runs compare", names=RUNS, writes=False)
 def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
-    """Compare two runs, ID or ID:SETTING: differences in settings, and in results with confidence intervals."""
+    """Compare two runs, ID or ID:SETTING: differences in settings, and in results with confidence intervals.
+
+    Examples:
+        kerv runs compare main:ar main:kerv
+        kerv runs compare main last
+    """
     from kerv_cli.report import compare as comparing
 
     runs = _run_names(names, 2, 2, "two runs, ID or ID:SETTING")
@@ -216,11 +223,16 @@ def _result_cells(row: Row) -> dict[str, str]:
     return {"measure": row["measure"], **numbers, "95 % interval": interval, "": row.get("what", "")}
 
 
-@_command_on_runs("rerun", "kerv runs rerun last", "kerv runs rerun main --plan")
+@command("runs rerun", names=RUNS)
 def rerun(
     settings: CommandSettings, names: list[str], overrides: list[str], plan: ShowPlan = False, as_json: AsJson = False
 ) -> None:
-    """Repeat a sweep or rollout under a new name, and say whether the tokens are the same."""
+    """Repeat a sweep or rollout under a new name, and say whether the tokens are the same.
+
+    Examples:
+        kerv runs rerun last
+        kerv runs rerun main --plan
+    """
     from kerv_cli.catalogue.entries import find_run
 
     database, (name,) = database_of(settings), _run_names(names)
@@ -247,9 +259,14 @@ def rerun(
     typer.echo(f"both side by side: kerv runs compare {run.id} {entry.id}{results_word(overrides)}")
 
 
-@_command_on_runs("rm", "kerv runs rm last", "kerv runs rm main --yes")
+@command("runs rm", names=RUNS)
 def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
-    """Remove runs and everything in their folders, after asking for confirmation."""
+    """Remove runs and everything in their folders, after asking for confirmation.
+
+    Examples:
+        kerv runs rm last
+        kerv runs rm main --yes
+    """
     from kerv_cli.catalogue.entries import check_removable, disk_bytes, find_run, remove
 
     database = database_of(settings)
@@ -271,11 +288,16 @@ def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     typer.echo(f"removed {what}")
 
 
-@_command_on_runs("export", "kerv runs export last", "kerv runs export main --to trace")
+@command("runs export", names=RUNS, writes=False)
 def export(
     settings: CommandSettings, names: list[str], to: To = "csv", folder: Folder = None, as_json: AsJson = False
 ) -> None:
-    """Write the episodes of a run as CSV, Parquet, a trace, or a database that 'kerv runs import' reads."""
+    """Write the episodes of a run as CSV, Parquet, a trace, or a database that 'kerv runs import' reads.
+
+    Examples:
+        kerv runs export last
+        kerv runs export main --to trace
+    """
     from kerv_cli.catalogue.entries import find_run
     from kerv_cli.report.export import export as hand_over
 
@@ -303,10 +325,14 @@ class ImportSettings(CommandSettings):
     ImportSettings,
     names="NAME: a kerv.db, vla-eval's recording-….sqlite, or folders that hold one.",
     keys="name baseline labels results",
-    examples=("kerv runs import ar/recording-1.sqlite kerv/recording-2.sqlite", "kerv runs import old-results"),
 )
 def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False) -> None:
-    """Import the runs of another results folder, or evaluations of vla-eval as a study."""
+    """Import the runs of another results folder, or evaluations of vla-eval as a study.
+
+    Examples:
+        kerv runs import ar/recording-1.sqlite kerv/recording-2.sqlite
+        kerv runs import old-results
+    """
     from kerv_cli.catalogue.evaluations import import_evaluations
     from kerv_cli.catalogue.imports import database_in, import_databases
     from kerv_cli.lab.store import Study

@@ -17,11 +17,15 @@ from kerv_cli.serve.settings import ServeSettings
     "serve",
     ServeSettings,
     keys="protocol policy method task host port gripper origins",
-    examples=("kerv serve policy=vision method=one_pass", "kerv serve protocol=vla_eval policy=state method=spec_vla"),
     typed={"task": "task_name"},  # renamed, because task= of other commands is a list
 )
 def serve(settings: ServeSettings, plan: ShowPlan = False) -> None:
-    """Serve a policy with any method over websockets: observations in, actions out, until Ctrl-C."""
+    """Serve a policy with any method over websockets: observations in, actions out, until Ctrl-C.
+
+    Examples:
+        kerv serve policy=vision method=one_pass
+        kerv serve protocol=vla_eval policy=state method=spec_vla
+    """
     from kerv_cli.serve.policy import Policy
     from kerv_cli.serve.server import PolicyServer
 

@@ -9,7 +9,7 @@ import typer
 from kerv_cli.base.config import compose, expand, groups, split
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
-from kerv_cli.cli.command import command
+from kerv_cli.cli.command import Cfg, command
 from kerv_cli.cli.common import AsJson, ShowPlan, end_with_json, end_with_plan, print_rows
 from kerv_cli.cli.studies import (
     planned_study,
@@ -32,13 +32,16 @@ if TYPE_CHECKING:
     "sweep",
     SweepSettings,
     keys="study task episodes policy rerun loss runtime.workers runtime.executor results",
-    examples=("kerv sweep study=demo", "kerv sweep study=threshold task=[reach,push] episodes=5 --plan"),
     each="rollout",
 )
-def sweep(overrides: list[str], cfg: bool = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:
+def sweep(overrides: list[str], cfg: Cfg = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Run a study: every setting on every task with the same seeds, in turn. Existing episodes are reused.
 
     Without study= it lists all studies. The same command continues an interrupted study.
+
+    Examples:
+        kerv sweep study=demo
+        kerv sweep study=threshold task=[reach,push] episodes=5 --plan
     """
     if not cfg and not any(word.split("=")[0].split(".")[0] == "study" for word in overrides):
         others = [word for word in overrides if not word.startswith(("results=", "store="))]

@@ -17,13 +17,14 @@ from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
     "train target",
     TrainTargetSettings,
     keys="name demos task quick target target.observation train.steps train.init runtime.device",
-    examples=(
-        "kerv train target name=mine demos=mt10",
-        "kerv train target name=first task=reach quick=true --plan",
-    ),
 )
 def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
-    """Train a target policy on demonstrations by behaviour cloning."""
+    """Train a target policy on demonstrations by behaviour cloning.
+
+    Examples:
+        kerv train target name=mine demos=mt10
+        kerv train target name=first task=reach quick=true --plan
+    """
     typer.echo(f"target {settings.name}: {settings.train.steps} steps", err=True)
     from kerv_cli.training.target import train_target
 
@@ -34,13 +35,14 @@ def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJso
     "train drafter",
     TrainDrafterSettings,
     keys="policy.target drafter demos task policy.artifacts train.steps runtime.device",
-    examples=(
-        "kerv train drafter policy.target=mine demos=mt10",
-        "kerv train drafter drafter=early policy.target=mine",
-    ),
 )
 def drafter(settings: TrainDrafterSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
-    """Train a drafter to imitate a target's greedy decodes. drafter=NAME chooses its kind, such as early."""
+    """Train a drafter to imitate a target's greedy decodes. drafter=NAME chooses its kind, such as early.
+
+    Examples:
+        kerv train drafter policy.target=mine demos=mt10
+        kerv train drafter drafter=early policy.target=mine
+    """
     typer.echo(f"drafter={settings.drafter.kind} of {settings.policy.target}: {settings.train.steps} steps", err=True)
     from kerv_cli.training.drafter import train_drafter
 

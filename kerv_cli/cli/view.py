@@ -15,13 +15,16 @@ from kerv_cli.cli.common import database_of
 @command(
     "view",
     CommandSettings,
-    keys="results",
-    examples=("kerv view last", "kerv view NAME.rrd"),
     names="NAME: runs (id, a unique part of it, or last), recordings (.rrd) or folders of them, and results=DIR.",
     writes=False,
 )
 def view(settings: CommandSettings, names: list[str]) -> None:
-    """Open recordings in the Rerun viewer; without a display, print the command that opens them."""
+    """Open recordings in the Rerun viewer; without a display, print the command that opens them.
+
+    Examples:
+        kerv view last
+        kerv view NAME.rrd
+    """
     from kerv_cli.report.viewing.viewer import find_recordings, open_recording
 
     paths = [_place(settings, name) for name in names]

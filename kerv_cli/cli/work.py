@@ -11,14 +11,14 @@ from kerv_cli.cli.studies import event_printer
 from kerv_cli.episodes.settings import WorkSettings
 
 
-@command(
-    "work",
-    WorkSettings,
-    keys="study results",
-    examples=("kerv work study=demo", "kerv work study=main store=postgresql://me@server/kerv"),
-)
+@command("work", WorkSettings, keys="study results")
 def work(settings: WorkSettings) -> None:
-    """Run blocks of a study that 'kerv sweep' has planned, until none is left; on any machine, as often as you like."""
+    """Run blocks of a study that 'kerv sweep' has planned, until none is left; on any machine, as often as you like.
+
+    Examples:
+        kerv work study=demo
+        kerv work study=main store=postgresql://me@server/kerv
+    """
     from kerv_cli.base.processes import end_with_input
     from kerv_cli.episodes.resolve import study_name
     from kerv_cli.lab.database import opened

@@ -21,14 +21,14 @@ class SeedsSettings(TaskSettings):
     use: str = choice("evaluation", "evaluation", "demonstrations", help="what the seeds are for")
 
 
-@command(
-    "seeds",
-    SeedsSettings,
-    keys="task episodes use",
-    examples=("kerv seeds task=reach", "kerv seeds use=demonstrations episodes=10 --json"),
-)
+@command("seeds", SeedsSettings, keys="task episodes use")
 def seeds(settings: SeedsSettings, as_json: AsJson = False) -> None:
-    """Print the seeds of a task's episodes."""
+    """Print the seeds of a task's episodes.
+
+    Examples:
+        kerv seeds task=reach
+        kerv seeds use=demonstrations episodes=10 --json
+    """
     from kerv_cli.worlds import resolve_tasks
 
     first = EVALUATION_SEED if settings.use == "evaluation" else 0
