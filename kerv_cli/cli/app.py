@@ -38,10 +38,10 @@ class Commands(FastFlags, TyperGroup):
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return the command or the group of commands with this name. None if there is neither."""
         name = self.prefix + cmd_name
-        below = commands(name.split()[0])
+        below = commands(name)
         if name in below:
             return typer_command(below[name])
-        if not any(one.startswith(f"{name} ") for one in below):
+        if not below:
             return None
         help = FAMILIES.get(name)
         family = Commands(name=cmd_name, help=help, short_help=help, no_args_is_help=True, rich_markup_mode=None)

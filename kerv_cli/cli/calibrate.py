@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import fields
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
@@ -16,7 +14,7 @@ from kerv_cli.episodes.settings import SweepSettings
 from kerv_cli.training.settings import CalibrateSettings, CalibrateSuccessSettings
 
 if TYPE_CHECKING:
-    from kerv_cli.methods.calibration import Calibration
+    from kerv_cli.methods.calibration import SkipSection
 
 
 @command(
@@ -35,45 +33,31 @@ def constants(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
 
     with as_planned(settings, plan) as (database, begin):
         path, calibration, notes = calibrate(settings, database, begin)
-    for table in _tables(calibration, path):
-        print_table(*table)
-    for line in notes:
-        typer.echo(line)
-
-
-def _tables(calibration: Calibration, path: Path) -> Iterator[tuple[tuple[str, ...], list[tuple[object, ...]], str]]:
-    """Yield tables: K_S of each task, and thresholds of each task.
-
-    K_S is the reference level of a task's kinematic variability (docs/methods.md §3). The thresholds say when a
-    retrieved chunk may be executed without verification (§4). Without thresholds, the last table is left out.
-
-    Args:
-        calibration: The calibration.
-        path: The calibration's file, named in the title of the tables.
-
-    Yields:
-        Column names, rows and title of each table.
-    """
-    columns: tuple[str, ...] = ("task", "fitted on", "decodes", "K_S")
     rows: list[tuple[object, ...]] = []
     for name, counts in calibration.demos.tasks.items():
         row = calibration.variability.get(name)
         levels = [row.decodes, f"{row.k_s:.3f}"] if row else ["-"] * 2
         rows.append((name, counts["training"], *levels))
-    yield columns, rows, f"calibration in {path}"
+    print_table(("task", "fitted on", "decodes", "K_S"), rows, f"calibration in {path}")
+    if calibration.skip is not None:
+        _print_skip(calibration.skip)
+    for line in notes:
+        typer.echo(line)
 
-    skip = calibration.skip
-    if skip is None:
-        return
-    rows = []
+
+def _print_skip(skip: SkipSection) -> None:
+    """Print when a retrieved chunk of each task may be executed without verification (docs/methods.md §4)."""
+    rows: list[tuple[object, ...]] = []
     for name, task in skip.tasks.items():
-        levels = [f"{x:.4f}" for x in (task.s_min, task.low, task.high)] if task.share else ["never", "-", "-"]
-        figures = [f"{task.within:.1%}", f"{task.error:.4f}"] if task.share else ["-", "-"]
+        levels, figures = ("never", "-", "-"), ("-", "-")
+        if task.share:
+            levels = f"{task.s_min:.4f}", f"{task.low:.4f}", f"{task.high:.4f}"
+            figures = f"{task.within:.1%}", f"{task.error:.4f}"
         rows.append((name, *levels, f"{task.share:.1%}", *figures, task.entries))
     limit = f"error ≤ {skip.epsilon:g}"
     columns = ("task", "s_min", "low", "high", "would be skipped", limit, "mean error", "entries")
     best = f"best neighbour in another episode, {skip.confidence:.0%} with an error of at most {skip.epsilon:g}"
-    yield columns, rows, f"verify-skip, {best}"
+    print_table(columns, rows, f"verify-skip, {best}")
 
 
 OF_TEST = {at.name for at in fields(CalibrateSuccessSettings)} - {at.name for at in fields(SweepSettings)}

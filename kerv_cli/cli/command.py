@@ -14,7 +14,7 @@ from __future__ import annotations
 import functools
 import inspect
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -114,20 +114,23 @@ def commands(words: str = "") -> dict[str, Command]:
     """
     files, file = MODULES["command"], f"kerv_cli.cli.{words.partition(' ')[0]}"
     found = parts("command", file if file in files else "")
-    chosen = [cast(Command, part) for name, part in found.items() if f"{name} ".startswith(f"{words} ".lstrip())]
-    chosen.sort(key=lambda part: [*files, part.module].index(part.module))  # plugins last
-    return {part.name: part for part in chosen}
+    names = sorted(found, key=lambda name: [*files, found[name].module].index(found[name].module))  # plugins last
+    return {name: cast(Command, found[name]) for name in names if f"{name} ".startswith(f"{words} ".lstrip())}
 
 
 def typer_command(part: Command) -> TyperCommand:
     """Make a typer command from a registered command. `CommandWithSettings.invoke` fills in its arguments."""
-    help = "\n\n".join(filter(None, (part.help, part.names)))
-    words = {**CONTEXT, "allow_extra_args": True}  # if typer parsed the arguments, it would import pydantic
-    made = _made(part.code, name=part.name, cls=CommandWithSettings, help=help, context_settings=words)
-    made.part, made.short_help = part, part.summary
+    help, metavar = "\n\n".join(filter(None, (part.help, part.names))), "NAME" if part.names else "KEY=VALUE"
+    made = _made(
+        part.code, name=part.name, cls=CommandWithSettings, help=help, short_help=part.summary,
+        options_metavar=f"[OPTIONS] [{metavar}]...",
+        context_settings={**CONTEXT, "allow_extra_args": True},  # typer would import pydantic to parse arguments
+    )  # fmt: skip
+    made.part = part
     made.arguments = [one.name for one in made.params if one.param_type_name == "argument"]
-    options = [one for one in made.params if one.param_type_name == "option"]
-    made.params = [*_made(_with_settings).params, *options] if "settings" in made.arguments else options
+    made.params = [one for one in made.params if one.param_type_name == "option"]
+    if "settings" in made.arguments:
+        made.params[:0] = _made(_with_settings).params
     return cast(TyperCommand, made)
 
 
@@ -140,27 +143,6 @@ def _made(code: Callable[..., None], **more: Any) -> Any:
 
 def _with_settings(cfg: Cfg = False) -> None:
     """Declare the option of every command with settings."""
-
-
-def complete(part: Command, typed: Sequence[str], incomplete: str) -> list[str]:
-    """Complete an override in the shell: `me` becomes `method=`, and `method=s` every method that begins with s.
-
-    bash passes `method`, `=` and `s` as three words, other shells pass one.
-
-    Args:
-        part: The command.
-        typed: The words before the one to complete.
-        incomplete: The beginning of the word to complete.
-    """
-    words, before = top_keys(part), list(filter("=".__ne__, typed))
-    key, equals, _ = incomplete.partition("=")
-    if before and before[-1] in words:
-        words = _values(part, before[-1])
-    elif equals:
-        words = [f"{key}={name}" for name in _values(part, key)]
-    else:
-        words = [f"{word}=" for word in words]
-    return [word for word in words if word.startswith(incomplete)]
 
 
 def _values(part: Command, key: str) -> list[str]:
@@ -269,28 +251,37 @@ class CommandWithSettings(FastFlags, TyperCommand):
                 part.code(**{name: given[name] for name in self.arguments}, **options)
 
     def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
-        """Complete an option or an override."""
+        """Complete an option or an override: `me` to `method=`, and `method=s` to every method that begins with s.
+
+        bash passes `method`, `=` and `s` as three words, other shells pass one.
+        """
         if incomplete.startswith("-"):
             return super().shell_complete(ctx, incomplete)
         from typer._click.shell_completion import CompletionItem
 
-        return [CompletionItem(word) for word in complete(self.part, ctx.args, incomplete)]
-
-    def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return the words of the help's first line, which says how to type the command."""
-        return [*super().collect_usage_pieces(ctx), "[NAME]..." if self.part.names else "[KEY=VALUE]..."]
+        keys, before = top_keys(self.part), ["", *filter("=".__ne__, ctx.args)][-1]
+        key, equals, _ = incomplete.partition("=")
+        prefix, names, suffix = "", keys, "="
+        if before in keys:
+            names, suffix = _values(self.part, before), ""
+        elif equals:
+            prefix, names, suffix = f"{key}=", _values(self.part, key), ""
+        return [CompletionItem(f"{prefix}{x}{suffix}") for x in names if f"{prefix}{x}".startswith(incomplete)]
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
         """Add the most used settings, the subcommands and the examples to the help."""
-        keys = [_row(self.part, key) for key in self.part.shown]
         below = commands(self.part.name)
         below.pop(self.part.name, None)
-        if keys:
-            with formatter.section(f"Settings, with their defaults (all of them: kerv {self.part.name} --cfg)"):
-                formatter.write_dl(keys)
-        if below:
-            with formatter.section("Commands"):
-                formatter.write_dl([(name, part.summary) for name, part in below.items()])
+        sections: dict[str, list[tuple[str, str]]] = {
+            f"Settings, with their defaults (all of them: kerv {self.part.name} --cfg)": [
+                _row(self.part, key) for key in self.part.shown
+            ],
+            "Commands": [(name, part.summary) for name, part in below.items()],
+        }
+        for title, rows in sections.items():
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
         if self.part.examples:
             with formatter.section("Examples"):
                 for line in self.part.examples:
@@ -308,7 +299,9 @@ def _row(part: Command, key: str) -> tuple[str, str]:
         `key=default`, and the type with the description.
     """
     name = part.typed.get(key, key)
-    schema = next(schema for schema in schemas_of(part) if name.split(".")[0] in fields_of(schema))
+    schema, *others = schemas_of(part)
+    if name.split(".")[0] not in fields_of(schema):
+        (schema,) = others
     value: Any = _defaults(schema)
     for word in name.split("."):
         at = fields_of(value)[word]

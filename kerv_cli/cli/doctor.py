@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import starmap
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -83,19 +85,19 @@ def check_machine(settings: DoctorSettings) -> list[Finding]:
     from kerv_cli.targets.provenance import versions
     from kerv_cli.worlds import specs
 
-    display = "a display is there: kerv view opens a window" if has_display() else "none: kerv view prints the command"
-    findings = [Finding("versions", True, ", ".join(map(" ".join, versions().items())))]
+    checks: dict[str, Callable[[], str]] = {}
     for spec in specs().values():
-        check = partial(_rendering, spec, settings)
-        findings.append(find(f"rendering {spec.name}", check))
-    findings.append(find("torch", partial(_torch, settings)))
+        checks[f"rendering {spec.name}"] = partial(_rendering, spec, settings)
+    checks["torch"] = partial(_torch, settings)
     for folder in filter(Path.is_dir, visible(shipped_dir())):
-        check = partial(_policy, folder.name, settings)
-        findings.append(find(f"policy {folder.name}", check))
-    findings.append(find("results", partial(_disk, settings)))
-    findings.append(find("database", partial(_database, settings)))
-    findings.append(Finding("display", True, display))
-    return findings
+        checks[f"policy {folder.name}"] = partial(_policy, folder.name, settings)
+    checks |= {"results": partial(_disk, settings), "database": partial(_database, settings)}
+    says = "a display is there: kerv view opens a window" if has_display() else "none: kerv view prints the command"
+    return [
+        Finding("versions", True, ", ".join(map(" ".join, versions().items()))),
+        *starmap(find, checks.items()),
+        Finding("display", True, says),
+    ]
 
 
 def check_policy(settings: DoctorSettings) -> list[Finding]:

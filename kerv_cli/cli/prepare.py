@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
 
 import typer
 
-from kerv_cli.base.errors import Interrupted
-from kerv_cli.cli.command import command, commands, typer_command
+from kerv_cli.cli.command import command
 from kerv_cli.cli.common import ShowPlan, database_of, print_table, results_word
 from kerv_cli.training.settings import PrepareSettings
 
@@ -31,6 +29,7 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
         kerv prepare policy.target=mine
         kerv prepare policy.target=mine quick=true --plan
     """
+    from kerv_cli.cli.app import app
     from kerv_cli.lab.runs import time_of
     from kerv_cli.training.preparation import THERE
     from kerv_cli.training.preparation import plan as planned
@@ -39,7 +38,8 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
     steps = planned(settings, database)
     lines, rows = {}, []
     for step in steps:
-        lines[step.kind] = line_of(step.command, overrides)
+        hidden = (*NOT_OF_STEPS, "demos") if step.command[-1] == "success" else NOT_OF_STEPS
+        lines[step.kind] = [*step.command, *(word for word in overrides if word.split("=")[0] not in hidden)]
         rows.append((step.kind, step.state, f"kerv {shlex.join(lines[step.kind])}"))
     print_table(("what", "state", "command"), rows, name)
     if plan:
@@ -52,26 +52,12 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
         states = {step.kind: step.state for step in planned(settings, database)}
         if states[kind] != THERE:
             typer.echo(f"\nkerv {shlex.join(line)}")
-            run(line)
+            if code := typer.main.get_command(app).main(line, standalone_mode=False):
+                raise typer.Exit(code)
     if failing := unsolved_by(settings):
         typer.echo(f"\n{name}: {failing}")
         return
     typer.echo(f"\n{name} is ready: kerv sweep study=own policy.target={name}{results_word(overrides)}")
-
-
-def line_of(command: Sequence[str], overrides: Sequence[str]) -> list[str]:
-    """Return a step's command-line arguments after `kerv`.
-
-    Args:
-        command: The step's own arguments.
-        overrides: Overrides of `kerv prepare`. An override is appended if the step has the same setting.
-    """
-    line = list(command)
-    for word in overrides:
-        key = word.split("=")[0]
-        if key not in NOT_OF_STEPS and (key != "demos" or command[-1] != "success"):
-            line.append(word)
-    return line
 
 
 def unsolved_by(settings: PrepareSettings) -> str:
@@ -87,24 +73,3 @@ def unsolved_by(settings: PrepareSettings) -> str:
     first = artifact.read(path).candidates[0]
     success = first.ar / first.pairs if first.pairs else 1.0
     return unsolved("autoregressive decoding", success) if success < SOLVED else ""
-
-
-def run(line: Sequence[str]) -> None:
-    """Run another command of kerv in this process.
-
-    Args:
-        line: Command-line arguments after `kerv`.
-
-    Raises:
-        KervError: The command failed.
-        Interrupted: The user pressed Ctrl-C.
-        typer.Exit: The command failed, and has printed the reason.
-    """
-    known = commands(line[0])
-    name = max((name for name in known if " ".join(line).startswith(f"{name} ")), key=len)
-    try:
-        code = typer_command(known[name]).main(list(line[len(name.split()) :]), standalone_mode=False)
-    except typer.Abort:  # typer's exception for Ctrl-C
-        raise Interrupted("interrupted: what is made is kept, the same command goes on there") from None
-    if code:
-        raise typer.Exit(code)

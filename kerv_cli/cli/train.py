@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import typer
 
@@ -26,9 +24,13 @@ def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJso
         kerv train target name=first task=reach quick=true --plan
     """
     typer.echo(f"target {settings.name}: {settings.train.steps} steps", err=True)
+    from kerv_cli.report.plots import save_curves
     from kerv_cli.training.target import train_target
 
-    _train(train_target, settings, plan, as_json)
+    with as_planned(settings, plan, as_json) as (database, begin):
+        folder, metrics = train_target(settings, database, begin)
+        curves = save_curves(folder)
+    _print(folder, metrics, curves, as_json)
 
 
 @command(
@@ -44,19 +46,18 @@ def drafter(settings: TrainDrafterSettings, plan: ShowPlan = False, as_json: AsJ
         kerv train drafter drafter=early policy.target=mine
     """
     typer.echo(f"drafter={settings.drafter.kind} of {settings.policy.target}: {settings.train.steps} steps", err=True)
+    from kerv_cli.report.plots import save_curves
     from kerv_cli.training.drafter import train_drafter
 
-    _train(train_drafter, settings, plan, as_json)
-
-
-def _train(train: Callable[..., tuple[Path, dict[str, float]]], settings: Any, plan: bool, as_json: bool) -> None:
-    """Train. Print the metrics of the best weights, their folder, and the paths of the training curves."""
-    from kerv_cli.report.plots import save_curves
-
     with as_planned(settings, plan, as_json) as (database, begin):
-        folder, metrics = train(settings, database, begin)
-        plot = save_curves(folder)
+        folder, metrics = train_drafter(settings, database, begin)
+        curves = save_curves(folder)
+    _print(folder, metrics, curves, as_json)
+
+
+def _print(folder: Path, metrics: dict[str, float], curves: Path, as_json: bool) -> None:
+    """Print the metrics of the best weights, their folder, and the paths of the training curves."""
     if as_json:
-        end_with_json({"folder": folder, "best": metrics, "curves": plot})
+        end_with_json({"folder": folder, "best": metrics, "curves": curves})
     print_figures("best checkpoint", metrics, folder)
-    typer.echo(f"curves in {folder / 'log.csv'} and {plot}")
+    typer.echo(f"curves in {folder / 'log.csv'} and {curves}")
