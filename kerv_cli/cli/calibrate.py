@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import typer
 
-from kerv_cli.base.config import compose
 from kerv_cli.cli.command import Cfg, command
 from kerv_cli.cli.common import AsJson, ShowPlan, as_planned, end_with_json, print_rows, print_table, settings_yaml
-from kerv_cli.episodes.settings import SweepSettings
 from kerv_cli.training.settings import CalibrateSettings, CalibrateSuccessSettings
 
 if TYPE_CHECKING:
@@ -60,10 +57,6 @@ def _print_skip(skip: SkipSection) -> None:
     print_table(columns, rows, f"verify-skip, {best}")
 
 
-OF_TEST = {at.name for at in fields(CalibrateSuccessSettings)} - {at.name for at in fields(SweepSettings)}
-"""Settings of the statistical test. All other settings belong to the study."""
-
-
 @command(
     "calibrate success",
     CalibrateSuccessSettings,
@@ -82,17 +75,11 @@ def success(overrides: list[str], cfg: Cfg = False, plan: ShowPlan = False, as_j
     from kerv_cli.cli.studies import planned_study, print_settings, print_study_plan, run_study
     from kerv_cli.episodes.resolve import resolve
 
-    of_test: list[str] = []
-    of_study: list[str] = []
-    for word in overrides:
-        (of_test if word.split("=")[0] in OF_TEST else of_study).append(word)
-    if not any(word.startswith("study=") for word in of_study):
-        of_study.insert(0, f"study={CalibrateSuccessSettings.groups['study']}")
-    resolved = resolve(of_study)
-    settings = compose("calibrate_success", of_test, CalibrateSuccessSettings)
+    resolved = resolve(overrides, "calibrate_success", CalibrateSuccessSettings)
+    settings = cast(CalibrateSuccessSettings, resolved.sweep)
     if cfg:
         for line in settings_yaml(settings).splitlines():
-            if line.split(":")[0] in OF_TEST:
+            if line.split(":")[0] in ("margin", "delta", "again"):
                 typer.echo(line)
         typer.echo("---")
         print_settings(resolved)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from fractions import Fraction
-from typing import Any
 
 import typer
 
@@ -34,9 +33,7 @@ def compare(names: list[str], as_json: AsJson = False) -> None:
     """
     from kerv_cli.report.statistics import PairedCounts, difference, mcnemar, paired_difference, wilson
 
-    words, given = _options(names)
-    if len(words) != 2:
-        raise UsageError("name two success counts, as in kerv compare 17/20 14/20")
+    words, given = _two(names, "success counts, as in kerv compare 17/20 14/20")
     (a, first_of), (b, second_of) = map(_counts, words)
     first, second, p = wilson(a, first_of), wilson(b, second_of), None
     if given:
@@ -52,12 +49,15 @@ def compare(names: list[str], as_json: AsJson = False) -> None:
         change = difference(first, second)
     if as_json:
         end_with_json({"first": first._asdict(), "second": second._asdict(), "difference": change._asdict(), "p": p})
+    rows = []
+    for word, rate in zip(words, (first, second), strict=True):
+        rows.append((word, f"{rate.value:.1%}", f"{rate.low:.1%} to {rate.high:.1%}"))
+    low, high = f"{100 * change.low:+.1f}", f"{100 * change.high:+.1f}"
     name = "difference, unpaired (Newcombe)" if p is None else "difference, paired (Newcombe)"
-    rows = [(words[0], *_percent(*first)), (words[1], *_percent(*second)), (name, *_points(*change))]
+    rows.append((name, f"{100 * change.value:+.1f} points", f"{low} to {high}"))
     print_table(("", "success", "95 % interval"), rows)
     if p is not None:
         typer.echo(f"McNemar's exact test: p = {p:.2g}")
-    low, high = _points(*change)[1].split(" to ")
     if change.low <= 0 <= change.high:
         typer.echo(f"No difference is shown: anything from {low} to {high} points agrees with these counts.")
     elif p is not None and p >= 0.05:
@@ -77,9 +77,7 @@ def power(names: list[str], as_json: AsJson = False) -> None:
     """
     from kerv_cli.report.statistics import MOST_PAIRS, pairs_for_power
 
-    words, given = _options(names)
-    if len(words) != 2:
-        raise UsageError("name two success rates, as in kerv power 0.90 0.95")
+    words, given = _two(names, "success rates, as in kerv power 0.90 0.95")
     first, second = map(_number, words)
     if not (0 <= first <= 1 and 0 <= second <= 1) or first == second:
         raise UsageError(f"{' '.join(words)}: name two different success rates from 0 to 1, as in kerv power 0.90 0.95")
@@ -90,17 +88,15 @@ def power(names: list[str], as_json: AsJson = False) -> None:
         assumed = {"lost= as given": given["lost"]}
         if not least <= given["lost"] <= most:
             raise UsageError(f"lost= with these rates is a number from {float(least):.3g} to {float(most):.3g}")
-    plans: list[dict[str, Any]] = []
+    plans, rows, shown = [], [], []
     for name, loss in assumed.items():
         lost, won = float(loss), float(loss + gain)
-        plans.append({"assumption": name, "lost": lost, "won": won, "pairs": pairs_for_power(lost, won)})
+        pairs = pairs_for_power(lost, won)
+        plans.append({"assumption": name, "lost": lost, "won": won, "pairs": pairs})
+        shown.append(f"{pairs}" if pairs <= MOST_PAIRS else f"more than {MOST_PAIRS:,}")
+        rows.append((name, f"{lost:.1%}", f"{won:.1%}", shown[-1]))
     if as_json:
         end_with_json(plans)
-    rows, shown = [], []
-    for row in plans:
-        pairs = f"{row['pairs']}" if row["pairs"] <= MOST_PAIRS else f"more than {MOST_PAIRS:,}"
-        shown.append(pairs)
-        rows.append((row["assumption"], f"{row['lost']:.1%}", f"{row['won']:.1%}", pairs))
     print_table(("in a pair, only one side succeeds", "only the first", "only the second", "pairs needed"), rows)
     needed = " to ".join(dict.fromkeys(shown))
     typer.echo(
@@ -109,8 +105,8 @@ def power(names: list[str], as_json: AsJson = False) -> None:
     )
 
 
-def _options(names: list[str]) -> tuple[list[str], Mapping[str, Fraction]]:
-    """Split the arguments into counts or rates, and the numbers given as `key=number`."""
+def _two(names: list[str], what: str) -> tuple[list[str], Mapping[str, Fraction]]:
+    """Split the arguments into two counts or rates, and the numbers given as `key=number`."""
     words, numbers = [], {}
     for word in names:
         key, equals, value = word.partition("=")
@@ -118,6 +114,8 @@ def _options(names: list[str]) -> tuple[list[str], Mapping[str, Fraction]]:
             numbers[key] = _number(value, f"{key}=")
         else:
             words.append(word)
+    if len(words) != 2:
+        raise UsageError(f"name two {what}")
     return words, numbers
 
 
@@ -138,11 +136,3 @@ def _counts(text: str) -> tuple[int, int]:
     if not 0 < episodes >= successes:
         raise UsageError(f"{text}: successes come first, then episodes, as in 17/20")
     return successes, episodes
-
-
-def _percent(value: float, low: float, high: float) -> tuple[str, str]:
-    return f"{value:.1%}", f"{low:.1%} to {high:.1%}"
-
-
-def _points(value: float, low: float, high: float) -> tuple[str, str]:
-    return f"{100 * value:+.1f} points", f"{100 * low:+.1f} to {100 * high:+.1f}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -13,7 +12,6 @@ from kerv_cli.cli.common import AsJson, end_with_json, print_rows
 
 if TYPE_CHECKING:
     from kerv_cli.bench.described import Described
-    from kerv_cli.bench.prices import Estimate
     from kerv_cli.report.profiles import NamedProfile
 
 
@@ -33,7 +31,7 @@ def estimate(settings: EstimateSettings, as_json: AsJson = False) -> None:
     """
     from kerv_cli.bench.described import described
     from kerv_cli.bench.prices import NO_TOKENS, Estimate
-    from kerv_cli.bench.tables import document, notes, rate, sentence
+    from kerv_cli.bench.tables import document, family_rows, notes, part_rows, rate, sentence
 
     if settings.trace:
         _trace(settings, as_json)
@@ -59,7 +57,11 @@ def estimate(settings: EstimateSettings, as_json: AsJson = False) -> None:
     if as_json:
         end_with_json({"applies": True, "machines": rows})
     for row, (title, estimates) in zip(rows, found.items(), strict=True):
-        _print_tables(policy, title, estimates)
+        if policy and policy.shape:
+            engines = " / ".join(one.costs.name for one in estimates)
+            title = f"{policy.shape.name} on {title}, computed, not measured: {engines}"
+        print_rows(part_rows(estimates), title)
+        print_rows(family_rows(estimates), "speed against AR; break-even: accepted tokens per verification")
         for line in (*row["notes"], row.get("rate"), row["sentence"]):
             if line:
                 typer.echo(line)
@@ -78,17 +80,6 @@ def _costs(settings: EstimateSettings, policy: Described | None) -> list[tuple[s
         device = DEVICES[name]
         found += [(device.title, costs) for costs in computed(policy, device)]
     return found
-
-
-def _print_tables(policy: Described | None, title: str, estimates: Sequence[Estimate]) -> None:
-    """Print the parts of an action and the families of methods."""
-    from kerv_cli.bench.tables import family_rows, part_rows
-
-    if policy and policy.shape:
-        engines = " / ".join(one.costs.name for one in estimates)
-        title = f"{policy.shape.name} on {title}, computed, not measured: {engines}"
-    print_rows(part_rows(estimates), title)
-    print_rows(family_rows(estimates), "speed against AR; break-even: accepted tokens per verification")
 
 
 def _trace(settings: EstimateSettings, as_json: bool) -> None:

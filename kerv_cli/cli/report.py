@@ -15,7 +15,6 @@ from kerv_cli.cli.common import AsJson, end_with_json
 
 if TYPE_CHECKING:
     from kerv_cli.lab.database import Database
-    from kerv_cli.report.report import Report
     from kerv_cli.report.reprice import Priced
 
 
@@ -73,6 +72,7 @@ def report(
     from kerv_cli.episodes.resolve import study_name
     from kerv_cli.lab.database import opened
     from kerv_cli.report.report import report as write_reports
+    from kerv_cli.report.reprice import prices_table
 
     study, database = settings.only and study_name(settings.only), opened(settings.results)
     if choose:
@@ -80,7 +80,16 @@ def report(
         return
     reports = write_reports(database, study, publish, settings.on, settings.loss, settings.baseline)
     if as_json:
-        end_with_json(_as_json(reports))
+        files: list[Path] = []
+        priced: list[Priced] = []
+        studies, acceptance = {}, {}
+        for one in reports:
+            files += one.files
+            priced += one.priced
+            studies[one.data.name] = one.data.table
+            acceptance[one.data.name] = {label: tally.as_dict() for label, tally in one.data.tallies.items()}
+        prices = {"priced": prices_table(priced)} if priced else {}
+        end_with_json({"files": files, "studies": studies, "acceptance": acceptance, **prices})
     for one in reports:
         print_study(one.data, all_columns, "--all", explain)
     for one in reports:
@@ -89,23 +98,6 @@ def report(
         if study is None:
             typer.echo(one.data.name)
         print_verdict(one)
-
-
-def _as_json(reports: list[Report]) -> dict[str, object]:
-    """Return what reports contain, as JSON values."""
-    from kerv_cli.report.reprice import prices_table
-
-    files: list[Path] = []
-    priced: list[Priced] = []
-    studies, acceptance = {}, {}
-    for one in reports:
-        name, data = one.data.name, one.data
-        files += one.files
-        priced += one.priced
-        studies[name] = data.table
-        acceptance[name] = {label: tally.as_dict() for label, tally in data.tallies.items()}
-    content: dict[str, object] = {"files": files, "studies": studies, "acceptance": acceptance}
-    return content | ({"priced": prices_table(priced)} if priced else {})
 
 
 def _print_choice(database: Database, study: str | None, loss: float, as_json: bool) -> None:

@@ -4,26 +4,15 @@ from __future__ import annotations
 
 import shlex
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from kerv_cli.base.durations import about, count
 from kerv_cli.cli.command import Cfg, command
-from kerv_cli.cli.common import (
-    AsJson,
-    ShowPlan,
-    console,
-    end_with_json,
-    print_table,
-    results_word,
-    settings_yaml,
-)
+from kerv_cli.cli.common import AsJson, ShowPlan, console, end_with_json, print_table, results_word, settings_yaml
 from kerv_cli.cli.studies import SECONDS_PER_EPISODE, planned_study, run_study
 from kerv_cli.episodes.settings import RolloutSettings
-
-if TYPE_CHECKING:
-    from kerv_cli.lab.store import Study
 
 Many = Annotated[
     bool, typer.Option("-m", "--multirun", help="Run all combinations of settings with several values (a,b).")
@@ -60,26 +49,22 @@ def rollout(
             end_with_json({"settings": list(resolved.settings), "tasks": tasks, "episodes": total, "seconds": seconds})
         typer.echo(f"{names}: {count(len(tasks), 'task')}, {count(total, 'episode')}, {about(seconds)}")
         return
-    run_study(planned)
-    _print_rollout(planned, as_json, results_word(overrides))
-
-
-def _print_rollout(study: Study, as_json: bool, where: str) -> None:
     from kerv_cli.report.results import averaged, frame_of
     from kerv_cli.report.summary import SummaryTable, setting_tables
     from kerv_cli.report.tables import load_study
 
-    data = load_study(study)
+    run_study(planned)
+    data, name, recordings = load_study(planned), planned.name, planned.recordings
     if as_json:
-        end_with_json({"run": study.name, "folder": study.root, "settings": frame_of(averaged(data.results)),
-                       "tasks": data.per_task, "recordings": study.recordings})  # fmt: skip
-    if len(data.study.labels) > 1:
+        end_with_json({"run": name, "folder": planned.root, "settings": frame_of(averaged(data.results)),
+                       "tasks": data.per_task, "recordings": recordings})  # fmt: skip
+    if len(planned.labels) > 1:
         console().print(SummaryTable(data.results))
     else:
         for table in setting_tables(data):
             print_table(*table)
-    show = f"kerv runs show {study.name}{where}"
-    typer.echo(f"run {study.name} in {study.root}; its settings and figures: {show}")
-    if study.recordings:
-        first = shlex.quote(str(study.recordings[0]))
-        typer.echo(f"{count(len(study.recordings), 'recording')}; open one with: kerv view {first}")
+    show = f"kerv runs show {name}{results_word(overrides)}"
+    typer.echo(f"run {name} in {planned.root}; its settings and figures: {show}")
+    if recordings:
+        first = shlex.quote(str(recordings[0]))
+        typer.echo(f"{count(len(recordings), 'recording')}; open one with: kerv view {first}")

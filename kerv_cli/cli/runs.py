@@ -31,7 +31,6 @@ from kerv_cli.cli.common import (
 
 if TYPE_CHECKING:
     from kerv_cli.catalogue.entries import RunEntry
-    from kerv_cli.report.results import Row
 
 
 RUNS = "NAME: runs (id, a unique part of it, or last) and results=DIR."
@@ -61,7 +60,7 @@ def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a r
 
     if not least <= len(names) <= most:
         raise UsageError(f"name {what}: 'kerv runs list' shows them")
-    return [study_name(name.removeprefix("study=")) for name in names]
+    return list(map(study_name, names))
 
 
 @command("runs list", names=FILTERS, writes=False)
@@ -116,13 +115,13 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
         content = {**_entry_row(run), "made_from": origin, "bytes": size}
         content["settings"] = [] if data is None else data.table[data.table["label"].isin(labels)]
         end_with_json(content)
-    line = run.command_line or "unknown"
     lines = {"run": run.id, "kind": run.kind, "state": run.state, "started": run.started, "folder": run.folder}
-    lines |= run.labels
-    parts = {"made from": ", ".join(map(" ".join, origin.items()))} if origin else {}
-    words = "command" if run.has_episodes else "made by"
-    for name, value in (lines | {"size": f"{size / 1e6:.1f} MB", words: line} | parts).items():
-        typer.echo(f"{name:<9} {value}")
+    lines |= {**run.labels, "size": f"{size / 1e6:.1f} MB"}
+    lines["command" if run.has_episodes else "made by"] = run.command_line or "unknown"
+    if origin:
+        lines["made from"] = ", ".join(map(" ".join, origin.items()))
+    for word, value in lines.items():
+        typer.echo(f"{word:<9} {value}")
     if data is not None:
         console().print(SummaryTable([row for row in data.results if row.label in labels]))
     elif run.figures:
@@ -190,17 +189,18 @@ def watch(settings: CommandSettings, names: list[str]) -> None:
 
 
 @command("runs compare", names=RUNS, writes=False)
-def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
+def compare_(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Compare two runs, ID or ID:SETTING: differences in settings, and in results with confidence intervals.
 
     Examples:
         kerv runs compare main:ar main:kerv
         kerv runs compare main last
     """
-    from kerv_cli.report import compare as comparing
+    from kerv_cli.report.compare import compare, pairs_to_compare
+    from kerv_cli.report.results import is_number
 
     runs = _run_names(names, 2, 2, "two runs, ID or ID:SETTING")
-    comparisons = list(starmap(comparing.compare, comparing.pairs_to_compare(database_of(settings), *runs)))
+    comparisons = list(starmap(compare, pairs_to_compare(database_of(settings), *runs)))
     if as_json:
         end_with_json(comparisons)
     for comparison in comparisons:
@@ -209,18 +209,14 @@ def compare(settings: CommandSettings, names: list[str], as_json: AsJson = False
             print_rows(comparison["settings"])
         else:
             typer.echo("no difference in settings, weights, machine or versions")
-        print_rows(list(map(_result_cells, comparison["results"])))
+        rows = []
+        for row in comparison["results"]:
+            numbers = {name: f"{row[name]:.4g}" for name in ("first", "second", "change")}
+            interval = f"{row['low']:.3g} to {row['high']:.3g}" if is_number(row.get("low")) else ""
+            rows.append({"measure": row["measure"], **numbers, "95 % interval": interval, "": row.get("what", "")})
+        print_rows(rows)
         if comparison["note"]:
             typer.echo(comparison["note"])
-
-
-def _result_cells(row: Row) -> dict[str, str]:
-    """Return the cells of one measure in the comparison of two runs."""
-    from kerv_cli.report.results import is_number
-
-    interval = f"{row['low']:.3g} to {row['high']:.3g}" if is_number(row.get("low")) else ""
-    numbers = {name: f"{row[name]:.4g}" for name in ("first", "second", "change")}
-    return {"measure": row["measure"], **numbers, "95 % interval": interval, "": row.get("what", "")}
 
 
 @command("runs rerun", names=RUNS)

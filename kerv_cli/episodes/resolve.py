@@ -95,22 +95,26 @@ class ResolvedStudy:
         return found
 
 
-def resolve(overrides: Sequence[str]) -> ResolvedStudy:
+def resolve(
+    overrides: Sequence[str], command: str = "sweep", schema: type[SweepSettings] = SweepSettings
+) -> ResolvedStudy:
     """Compose all settings of the study that the command line chooses.
 
     Args:
-        overrides: The command line's `key=value` arguments. Settings of `kerv sweep`, such as `study` and `results`,
+        overrides: The command line's `key=value` arguments. Settings of the command, such as `study` and `results`,
             configure the sweep. `results` and all other overrides apply to every setting of the study.
+        command: The command that runs the study, with `_` instead of a space.
+        schema: Dataclass of the command's settings.
 
     Raises:
         UsageError: A key or name is unknown. Or the study has no settings or lacks its baseline. Or one of its settings
             sets a key that the command line sets, too. Or a label is empty, too long or not one line.
     """
-    of_sweep = [o for o in overrides if _key(o).split(".")[0] in SweepSettings.__dataclass_fields__]
+    of_sweep = [o for o in overrides if _key(o).split(".")[0] in schema.__dataclass_fields__]
     of_settings = [o for o in overrides if o not in of_sweep or o.startswith("results=")]
-    sweep = compose("sweep", of_sweep, SweepSettings)
+    sweep = compose(command, of_sweep, schema)
     files = dict(override.split("=", 1) for override in of_sweep)
-    study, path = sweep.study, preset_file("study", files.get("study", SweepSettings.groups["study"]))
+    study, path = sweep.study, preset_file("study", files.get("study", schema.groups["study"]))
     study.name, typed = study.name or path.stem, set(map(_key, of_settings))
     with _line_of(path, typed, "common"):
         common = _outranked(split(study.common), of_settings)
