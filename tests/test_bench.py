@@ -27,7 +27,7 @@ from kerv_cli.methods.eagle.drafter import DrafterProposer
 
 pytestmark = pytest.mark.usefixtures("quick_report")
 
-NANO = BenchSettings(model="nano", dtype="float32")
+NANO = BenchSettings(target="nano", dtype="float32")
 
 Played = tuple[str, int, int, int, str]
 """Mode, start, nodes, accepted, proposer."""
@@ -112,7 +112,7 @@ def test_the_sizes_of_a_grown_target_are_those_of_its_new_layers(policies, tmp_p
     shape = ["grow.width=128", "grow.heads=2", "grow.feed_forward=160", "grow.layers=3", "grow.prompt=70"]
     nano = f"{policies}/artifacts/target/nano-vision"
     kerv("build", "target", *shape, "grow.drafter=true", f"policy.target={nano}", "name=large", f"results={tmp_path}")
-    model, base = (open_model(BenchSettings(model=name, results=str(tmp_path))) for name in ("large", nano))
+    model, base = (open_model(BenchSettings(target=name, results=str(tmp_path))) for name in ("large", nano))
     sizes, s = model.sizes, base.target.settings
     tokens = base.target.actions.tokens
     assert sizes.trunk_weights == 3 * (4 * 128**2 + 3 * 128 * 160) + s.width * tokens
@@ -127,7 +127,7 @@ def test_the_sizes_of_a_grown_target_are_those_of_its_new_layers(policies, tmp_p
 def test_the_sizes_of_an_openvla_policy_are_counted_and_its_decodes_measured(tmp_path):
     write_checkpoint(tmp_path / "tiny")
     kerv("build", "target", "target=openvla", f"checkpoint={tmp_path}/tiny", f"results={tmp_path}")
-    settings = BenchSettings(model="openvla", repeats=3, results=str(tmp_path))
+    settings = BenchSettings(target="openvla", repeats=3, results=str(tmp_path))
     model = open_model(settings)
     machine = measure_machine(model.target.device, model.dtype)
     width, layers = TINY.language.hidden_size, TINY.language.num_hidden_layers

@@ -35,7 +35,7 @@ def test_a_captured_graph_computes_what_eager_forwards_do():
 
 
 def test_strict_methods_decode_the_baselines_tokens():
-    model = open_model(BenchSettings(model="nano", dtype="float32", runtime=RuntimeSettings(device="cuda")))
+    model = open_model(BenchSettings(target="nano", dtype="float32", runtime=RuntimeSettings(device="cuda")))
     autoregressive = Decoder(model.target).decode(model.observation)
     assert sum(autoregressive.phases.values()) == pytest.approx(autoregressive.seconds, rel=0.2)
     for proposer in (JacobiProposer(), DrafterProposer(model.drafter, model.target, 5, 3, 12)):
@@ -43,7 +43,7 @@ def test_strict_methods_decode_the_baselines_tokens():
 
 
 def test_a_round_waits_once():
-    model = open_model(BenchSettings(model="nano", dtype="float32", runtime=RuntimeSettings(device="cuda")))
+    model = open_model(BenchSettings(target="nano", dtype="float32", runtime=RuntimeSettings(device="cuda")))
     for proposer in (None, JacobiProposer(), *(DrafterProposer(model.drafter, model.target, 5, k, 9) for k in (1, 3))):
         decoder = Decoder(model.target, Parts(proposer=proposer))
         decoder.decode(model.observation)  # captures its graphs, which waits
@@ -57,6 +57,6 @@ def test_a_round_waits_once():
 
 
 def test_ties_in_bfloat16_are_few():
-    model = open_model(BenchSettings(model="nano", dtype="bfloat16", runtime=RuntimeSettings(device="cuda")))
+    model = open_model(BenchSettings(target="nano", dtype="bfloat16", runtime=RuntimeSettings(device="cuda")))
     differ, compared = flipped(model, 4)
     assert differ <= compared // 4

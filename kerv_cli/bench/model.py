@@ -114,7 +114,7 @@ def layer_weights(settings: TargetSettings) -> int:
 
 
 def open_model(settings: BenchSettings) -> Model:
-    """Open `settings.model` for inference: a policy, or a shape of conf/target, which gets random weights.
+    """Open `settings.target` for inference: a policy, or a shape of conf/target, which gets random weights.
 
     A shape, or a policy without a drafter, gets a drafter with random weights.
 
@@ -124,27 +124,29 @@ def open_model(settings: BenchSettings) -> Model:
         CheckpointError: The policy is damaged.
     """
     shapes = groups()["target"]
-    if settings.model in shapes:
+    if settings.target in shapes:
         return _shape(settings)
     try:
-        find_target(settings.results, settings.model)
+        find_target(settings.results, settings.target)
     except UsageError as error:
-        raise UnknownName("target", settings.model, [*target_names(settings.results), *shapes]) from error
+        raise UnknownName("target", settings.target, [*target_names(settings.results), *shapes]) from error
     device, _ = set_up(settings.runtime)
-    artifacts = Artifacts(settings.results, PolicySettings(target=settings.model), None, device, settings.runtime.dtype)
+    artifacts = Artifacts(
+        settings.results, PolicySettings(target=settings.target), None, device, settings.runtime.dtype
+    )
     target: Any = artifacts.target
     if not hasattr(target, "layers"):
         family = artifacts.description.family
         raise UsageError(
-            f"target={settings.model}: the family '{family}' has no attribute `layers`, which kerv bench counts; "
+            f"target={settings.target}: the family '{family}' has no attribute `layers`, which kerv bench counts; "
             "add it (kerv_cli/engine/protocol.py)"
         )
     drafter = artifacts.load("drafter") if artifacts.path("drafter").exists() else _drafter(target)
-    return Model(settings.model, target, drafter, blank(target), False)
+    return Model(settings.target, target, drafter, blank(target), False)
 
 
 def _shape(settings: BenchSettings) -> Model:
-    shape = shape_of(settings.model, settings.tokens)
+    shape = shape_of(settings.target, settings.tokens)
     device = torch.device(set_up(settings.runtime)[0])
     on_cpu = device.type == "cpu"
     dtype = DTYPES[{"auto": "float32" if on_cpu else "bfloat16"}.get(settings.dtype, settings.dtype)]
@@ -152,12 +154,12 @@ def _shape(settings: BenchSettings) -> Model:
     needed, most = _SPARE * size * layer_weights(shape) * (shape.layers + 1), memory_of(device)
     if needed > most:
         raise UsageError(
-            f"target={settings.model} needs {needed / 1e9:.1f} GB in {str(dtype).removeprefix('torch.')}, {device} has "
-            f"{most / 1e9:.1f} GB: take a smaller shape, e.g. target=vla-150m"
+            f"target={settings.target} needs {needed / 1e9:.1f} GB in {str(dtype).removeprefix('torch.')}, "
+            f"{device} has {most / 1e9:.1f} GB: take a smaller shape, e.g. target=vla-150m"
         )
     with torch.inference_mode():
         target = random_target(shape, device, dtype)
-        return Model(settings.model, target, _drafter(target), blank(target), True)
+        return Model(settings.target, target, _drafter(target), blank(target), True)
 
 
 def shape_of(name: str, tokens: int) -> TargetSettings:

@@ -18,7 +18,6 @@ AsJson = Annotated[bool, typer.Option("--json", help="Also print the whole resul
     "bench",
     BenchSettings,
     keys="target dtype tokens repeats projected runtime.device runtime.dtype runtime.threads results",
-    typed={"target": "model"},  # renamed, because Hydra would take target= as a choice among the files of conf/target
 )
 def bench(settings: BenchSettings, as_json: AsJson = False) -> None:
     """Measure how long a target's decodes take, compared with what the device could do at best.

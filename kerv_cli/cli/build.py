@@ -15,7 +15,6 @@ from kerv_cli.training.settings import BuildDatastoreSettings, BuildDrafterSetti
     "build target",
     BuildTargetSettings,
     keys="grow policy.target target checkpoint name statistics environment check results",
-    # renamed, because Hydra would take target= as a choice among the files of conf/target
     typed={"target": "family", "policy.target": "base"},
 )
 def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:

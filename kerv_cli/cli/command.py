@@ -23,7 +23,7 @@ import typer
 from typer.core import TyperCommand
 
 from kerv_cli.base.config import compose, groups, plain_text
-from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.errors import UnknownName
 from kerv_cli.base.paths import check_writable
 from kerv_cli.base.registry import MODULES, NoSettings, Part, parts
 from kerv_cli.base.settings import CommandSettings, choices_of
@@ -201,9 +201,6 @@ def _settings(part: Command, overrides: list[str], cfg: bool) -> Any:
     named: list[str] = []
     for word in overrides:
         key, equals, value = word.partition("=")
-        own = key.rpartition(".")[2]
-        if own in part.typed and key not in part.typed and key.partition(".")[0] not in top_keys(part):
-            raise UsageError(f"unknown key '{key}': did you mean {own}?", key)
         named.append(f"{part.typed.get(key, key)}{equals}{value}")
     settings: Any = compose(part.name.replace(" ", "_"), named, part.settings)
     if cfg:

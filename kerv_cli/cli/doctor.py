@@ -44,7 +44,6 @@ class DoctorSettings(RunSettings):
     "doctor",
     DoctorSettings,
     keys="target environment world.camera.size runtime.device runtime.threads results",
-    # renamed, because Hydra would take target= as a choice among the files of conf/target
     typed={"target": "policy.target"},
     writes=False,
 )

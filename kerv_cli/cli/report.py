@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 class ReportSettings(CommandSettings):
     """Settings of `kerv report`."""
 
-    only: str | None = setting(None, "one study, by name or file; default: all studies in the results folder")
+    study: str | None = setting(None, "one study, by name or file; default: all studies in the results folder")
     on: list[str] = setting([], "profiles of 'kerv bench': estimate the study's times on those machines")
     baseline: str = setting("", "label of the setting to compare with; empty: the study's baseline")
     loss: float = number(3.0, above=0, most=99.9, help="largest loss of success that is accepted, percentage points")
@@ -47,13 +47,7 @@ Explain = Annotated[bool, typer.Option("--explain", help="Say in ten words what 
 AllColumns = Annotated[bool, typer.Option("--all", help="Print all columns of the table, in several parts if needed.")]
 
 
-@command(
-    "report",
-    ReportSettings,
-    keys="study results on baseline loss",
-    # renamed, because Hydra would take study= as a choice among the files of conf/study
-    typed={"study": "only"},
-)
+@command("report", ReportSettings, keys="study results on baseline loss")
 def report(
     settings: ReportSettings,
     publish: Publish = False,
@@ -74,7 +68,7 @@ def report(
     from kerv_cli.report.report import report as write_reports
     from kerv_cli.report.reprice import prices_table
 
-    study, database = settings.only and study_name(settings.only), opened(settings.results)
+    study, database = settings.study and study_name(settings.study), opened(settings.results)
     if choose:
         _print_choice(database, study, settings.loss, as_json)
         return
