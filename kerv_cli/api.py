@@ -8,7 +8,7 @@ a message of one line.
 from __future__ import annotations
 
 import os
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -175,7 +175,7 @@ def runs(results: str | Path = "results", store: str = "", **filters: str) -> pd
     """
     with chosen_store([f"store={store}"] if store else []):
         there = matching(find_runs(opened(results)), filters)
-    return pd.DataFrame([asdict(run) for run in there], columns=[column.name for column in fields(RunEntry)])
+    return pd.DataFrame(there, columns=list(RunEntry.__dataclass_fields__))
 
 
 class Policy:

@@ -46,13 +46,11 @@ def board(settings: BoardSettings) -> None:
     end_at_once()
 
 
-@command(
-    "board export",
-    names="NAME: a folder to write to, then runs (id, or a unique part of it; none: all), and results=DIR.",
-    writes=False,
-)
+@command("board export", writes=False)
 def export(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Write the board as files: tables, plots, films, tokens. They open without a server and can be sent.
+
+    NAME: a folder to write to, then runs (id, or a unique part of it; none: all), and results=DIR.
 
     Examples:
         kerv board export shared

@@ -1,12 +1,12 @@
 """Declare the commands of `kerv`: the decorator `command` turns a function into the command of that name.
 
 The decorator puts the function into kerv's registry. From that entry (a `Part` of kind `command`) this module makes
-typer's command with its options, settings, help and completion. The function is one of typer's: each parameter with a
-default is an option. Parameters without a default are arguments, and these are known:
+typer's command with its options, settings, help and completion. The function is one of typer's. kerv fills in three of
+its parameters, all others are typer's options:
 
 - `settings`: The command's settings, composed and checked. The command then has the option --cfg.
 - `overrides`: The `key=value` arguments as typed.
-- `names`: All other arguments, such as names of runs.
+- `names`: All other arguments, such as names of runs. The help describes them in a paragraph that begins with `NAME:`.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from kerv_cli.base.registry import MODULES, NoSettings, Part, parts
 from kerv_cli.base.settings import CommandSettings, choices_of
 from kerv_cli.cli.common import settings_yaml
 
+ARGUMENTS = ("settings", "overrides", "names")
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 120}
 Cfg = Annotated[bool, typer.Option("--cfg", help="Print the resolved settings and stop.")]
 
@@ -41,7 +42,6 @@ class Command(Part):
         name: Name of the command, such as `train target`.
         settings: Dataclass of its settings. NoSettings if it has none.
         keys: Names of the settings that `--help` lists, separated by spaces.
-        names: Help text for arguments that are not `key=value`. Empty: there are none.
         typed: Maps a key as typed on the command line to the name of the setting, if the two differ.
         writes: Whether the command writes to the results folder. If so, kerv first checks that the folder is writable.
         each: Name of another command, whose settings can be typed, too, such as `rollout` for `sweep`.
@@ -50,7 +50,6 @@ class Command(Part):
     kind = "command"
     settings: type = field(default=CommandSettings, kw_only=False)
     keys: str = "results"
-    names: str = ""
     typed: Mapping[str, str] = field(default_factory=dict)
     writes: bool = True
     each: str = ""
@@ -119,16 +118,13 @@ def commands(words: str = "") -> dict[str, Command]:
 
 
 def typer_command(part: Command) -> TyperCommand:
-    """Make a typer command from a registered command. `CommandWithSettings.invoke` fills in its arguments."""
-    help, metavar = "\n\n".join(filter(None, (part.help, part.names))), "NAME" if part.names else "KEY=VALUE"
-    made = _made(
-        part.code, name=part.name, cls=CommandWithSettings, help=help, short_help=part.summary,
-        options_metavar=f"[OPTIONS] [{metavar}]...",
-        context_settings={**CONTEXT, "allow_extra_args": True},  # typer would import pydantic to parse arguments
-    )  # fmt: skip
-    made.part = part
-    made.arguments = [one.name for one in made.params if one.param_type_name == "argument"]
-    made.params = [one for one in made.params if one.param_type_name == "option"]
+    """Make a typer command from a registered command. Its `invoke` fills in the arguments that are kerv's."""
+    words = {**CONTEXT, "allow_extra_args": True}  # typer would import pydantic to parse arguments
+    made = _made(part.code, name=part.name, cls=CommandWithSettings, help=part.help, context_settings=words)
+    made.part, made.short_help = part, part.summary
+    made.arguments = [one.name for one in made.params if one.name in ARGUMENTS]
+    made.params = [one for one in made.params if one.name not in ARGUMENTS]
+    made.options_metavar = f"[OPTIONS] [{'NAME' if 'names' in made.arguments else 'KEY=VALUE'}]..."
     if "settings" in made.arguments:
         made.params[:0] = _made(_with_settings).params
     return cast(TyperCommand, made)
@@ -170,14 +166,12 @@ def _split(part: Command, typed: list[str], named: bool) -> tuple[list[str], lis
     Raises:
         UnknownName: An argument looks like an override, but the command has no such setting.
     """
-    if not named:
-        return typed, []
     keys = set(top_keys(part))
-    filters = set(re.findall(r"(\w+)=", part.names))
+    filters = set(re.findall(r"(\w+)=", part.help.partition("\n\nNAME: ")[2]))
     overrides, names = [], []
     for word in typed:
         key, equals, _ = word.partition("=")
-        if equals and key.lstrip("+").split(".")[0] in keys:
+        if not named or (equals and key.lstrip("+").split(".")[0] in keys):
             overrides.append(word)
         elif equals and re.fullmatch(r"[\w.]+", key) and key not in filters and not Path(word).exists():
             raise UnknownName("key", key, sorted(keys | filters))

@@ -13,19 +13,13 @@ from kerv_cli.base.registry import NoSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, end_with_json, print_table
 
-COUNTS = (
-    "NAME: two success counts, such as 17/20. If both sides ran the same seeds, lost=N and won=N say in how many pairs "
-    "only the first and only the second succeeded."
-)
-RATES = (
-    "NAME: the success rate that you have and the one that you want to tell from it, such as 0.90 or 18/20. lost=SHARE "
-    "says in which share of pairs only the first succeeds; without it, both ends are shown."
-)
 
-
-@command("compare", NoSettings, keys="", names=COUNTS)
+@command("compare", NoSettings, keys="")
 def compare(names: list[str], as_json: AsJson = False) -> None:
     """Compare two success counts: the difference with its 95 % interval; no run is needed.
+
+    NAME: two success counts, such as 17/20. If both sides ran the same seeds, lost=N and won=N say in how many
+    pairs only the first and only the second succeeded.
 
     Examples:
         kerv compare 17/20 14/20
@@ -67,9 +61,12 @@ def compare(names: list[str], as_json: AsJson = False) -> None:
         typer.echo(f"The second succeeds {way} often: the difference is between {low} and {high} points.")
 
 
-@command("power", NoSettings, keys="", names=RATES)
+@command("power", NoSettings, keys="")
 def power(names: list[str], as_json: AsJson = False) -> None:
     """Say how many pairs of episodes show a difference of success with a probability of 80 %.
+
+    NAME: the success rate that you have and the one that you want to tell from it, such as 0.90 or 18/20.
+    lost=SHARE says in which share of pairs only the first succeeds; without it, both ends are shown.
 
     Examples:
         kerv power 0.90 0.95

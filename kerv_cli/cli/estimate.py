@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -67,19 +68,19 @@ def estimate(settings: EstimateSettings, as_json: AsJson = False) -> None:
                 typer.echo(line)
 
 
-def _costs(settings: EstimateSettings, policy: Described | None) -> list[tuple[str, NamedProfile]]:
-    """Return the costs on each machine with each engine, or of each profile, beside the machine's title."""
+def _costs(settings: EstimateSettings, policy: Described | None) -> Iterator[tuple[str, NamedProfile]]:
+    """Yield the costs on each machine with each engine, or of each profile, beside the machine's title."""
     from kerv_cli.bench.physics import DEVICES
     from kerv_cli.bench.prices import computed
     from kerv_cli.report.profiles import open_profiles
 
     if policy is None:
-        return [(one.title, one) for one in open_profiles(settings.results, settings.on)]
-    found = []
+        for one in open_profiles(settings.results, settings.on):
+            yield one.title, one
+        return
     for name in dict.fromkeys(settings.device):
-        device = DEVICES[name]
-        found += [(device.title, costs) for costs in computed(policy, device)]
-    return found
+        for costs in computed(policy, DEVICES[name]):
+            yield DEVICES[name].title, costs
 
 
 def _trace(settings: EstimateSettings, as_json: bool) -> None:

@@ -33,12 +33,6 @@ if TYPE_CHECKING:
     from kerv_cli.catalogue.entries import RunEntry
 
 
-RUNS = "NAME: runs (id, a unique part of it, or last) and results=DIR."
-FILTERS = "NAME: kind=, method=, task=, state=, since=, tag= and results=DIR narrow the list."
-WORDS = (
-    "NAME: a run (id, a unique part of it, or last), tag= (several: tag=a,b), note= and results=DIR. Empty: removed."
-)
-
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask; names must be whole.")]
 To = Annotated[str, typer.Option("--to", help="csv, parquet, db or trace.")]
 Folder = Annotated[Path | None, typer.Option("--dir", help="Folder to write to; default results/exports/FORMAT.")]
@@ -63,9 +57,11 @@ def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a r
     return list(map(study_name, names))
 
 
-@command("runs list", names=FILTERS, writes=False)
+@command("runs list", writes=False)
 def list_(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """List the runs of a results folder, the newest first.
+
+    NAME: kind=, method=, task=, state=, since=, tag= and results=DIR narrow the list.
 
     Examples:
         kerv runs list
@@ -92,9 +88,11 @@ def _entry_row(run: RunEntry) -> dict[str, object]:
     return {**asdict(run), "command": ["kerv", *run.command] if run.command else []}
 
 
-@command("runs show", names=RUNS, writes=False)
+@command("runs show", writes=False)
 def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Show one run, ID or ID:SETTING: its command, its results, the artifacts it was made from, its folder.
+
+    NAME: runs (id, a unique part of it, or last) and results=DIR.
 
     Examples:
         kerv runs show last
@@ -128,9 +126,11 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
         print_table(("measure", "value"), ((name, f"{value:.4g}") for name, value in run.figures.items()))
 
 
-@command("runs label", names=WORDS)
+@command("runs label")
 def label(settings: CommandSettings, names: list[str]) -> None:
     """Write tags and a note to a run. `kerv runs list tag=…`, the board and exports show them.
+
+    NAME: a run (id, a unique part of it, or last), tag= (several: tag=a,b), note= and results=DIR. Empty: removed.
 
     Examples:
         kerv runs label last tag=baseline
@@ -155,13 +155,11 @@ def label(settings: CommandSettings, names: list[str]) -> None:
     typer.echo(", ".join([run.id, *(f"{kind} {text}" for kind, text in (run.labels | changes).items() if text)]))
 
 
-@command(
-    "runs watch",
-    names="NAME: a run (id, or a unique part of it) and results=DIR. Without a name: all that run.",
-    writes=False,
-)
+@command("runs watch", writes=False)
 def watch(settings: CommandSettings, names: list[str]) -> None:
     """Follow what runs, from any terminal, until it ends: how far it is, and how long it takes.
+
+    NAME: a run (id, or a unique part of it) and results=DIR. Without a name: all that run.
 
     Examples:
         kerv runs watch
@@ -188,9 +186,11 @@ def watch(settings: CommandSettings, names: list[str]) -> None:
         typer.echo(f"{chosen} does not run: {runs[chosen].state}" if chosen else f"nothing runs in {settings.results}")
 
 
-@command("runs compare", names=RUNS, writes=False)
+@command("runs compare", writes=False)
 def compare_(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """Compare two runs, ID or ID:SETTING: differences in settings, and in results with confidence intervals.
+
+    NAME: runs (id, a unique part of it, or last) and results=DIR.
 
     Examples:
         kerv runs compare main:ar main:kerv
@@ -219,11 +219,13 @@ def compare_(settings: CommandSettings, names: list[str], as_json: AsJson = Fals
             typer.echo(comparison["note"])
 
 
-@command("runs rerun", names=RUNS)
+@command("runs rerun")
 def rerun(
     settings: CommandSettings, names: list[str], overrides: list[str], plan: ShowPlan = False, as_json: AsJson = False
 ) -> None:
     """Repeat a sweep or rollout under a new name, and say whether the tokens are the same.
+
+    NAME: runs (id, a unique part of it, or last) and results=DIR.
 
     Examples:
         kerv runs rerun last
@@ -255,9 +257,11 @@ def rerun(
     typer.echo(f"both side by side: kerv runs compare {run.id} {entry.id}{results_word(overrides)}")
 
 
-@command("runs rm", names=RUNS)
+@command("runs rm")
 def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     """Remove runs and everything in their folders, after asking for confirmation.
+
+    NAME: runs (id, a unique part of it, or last) and results=DIR.
 
     Examples:
         kerv runs rm last
@@ -284,11 +288,13 @@ def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     typer.echo(f"removed {what}")
 
 
-@command("runs export", names=RUNS, writes=False)
+@command("runs export", writes=False)
 def export(
     settings: CommandSettings, names: list[str], to: To = "csv", folder: Folder = None, as_json: AsJson = False
 ) -> None:
     """Write the episodes of a run as CSV, Parquet, a trace, or a database that 'kerv runs import' reads.
+
+    NAME: runs (id, a unique part of it, or last) and results=DIR.
 
     Examples:
         kerv runs export last
@@ -316,14 +322,11 @@ class ImportSettings(CommandSettings):
     labels: list[str] = setting([], "label of each recording, in order; empty: its method, or the name of its server")
 
 
-@command(
-    "runs import",
-    ImportSettings,
-    names="NAME: a kerv.db, vla-eval's recording-….sqlite, or folders that hold one.",
-    keys="name baseline labels results",
-)
+@command("runs import", ImportSettings, keys="name baseline labels results")
 def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False) -> None:
     """Import the runs of another results folder, or evaluations of vla-eval as a study.
+
+    NAME: a kerv.db, vla-eval's recording-….sqlite, or folders that hold one.
 
     Examples:
         kerv runs import ar/recording-1.sqlite kerv/recording-2.sqlite

@@ -12,14 +12,11 @@ from kerv_cli.cli.command import command
 from kerv_cli.cli.common import database_of
 
 
-@command(
-    "view",
-    CommandSettings,
-    names="NAME: runs (id, a unique part of it, or last), recordings (.rrd) or folders of them, and results=DIR.",
-    writes=False,
-)
+@command("view", CommandSettings, writes=False)
 def view(settings: CommandSettings, names: list[str]) -> None:
     """Open recordings in the Rerun viewer; without a display, print the command that opens them.
+
+    NAME: runs (id, a unique part of it, or last), recordings (.rrd) or folders of them, and results=DIR.
 
     Examples:
         kerv view last
