@@ -12,7 +12,7 @@ from kerv_cli.cli.command import command
 from kerv_cli.cli.common import database_of
 
 
-@command("view", CommandSettings, writes=False)
+@command("view", writes=False)
 def view(settings: CommandSettings, names: list[str]) -> None:
     """Open recordings in the Rerun viewer; without a display, print the command that opens them.
 
