@@ -14,9 +14,9 @@ from typing import Any
 from kerv_cli.bench.described import Described
 from kerv_cli.bench.expected import Decodes, Drafts, Recorded, nearest_table, recorded
 from kerv_cli.bench.physics import DEVICES, ENGINES, ROOFLINE, SHAPES, Device, Engine, Shape, priced
-from kerv_cli.bench.settings import BenchSettings
+from kerv_cli.bench.settings import BenchSettings, EstimateSettings
 from kerv_cli.engine.cost import Profile
-from kerv_cli.report.profiles import NamedProfile
+from kerv_cli.report.profiles import NamedProfile, open_profiles
 
 NO_TOKENS = (
     "speculation does not apply: the policy emits no action tokens, so there is nothing to draft. What applies: longer "
@@ -75,6 +75,20 @@ def computed(policy: Described, device: Device) -> list[NamedProfile]:
             bounds["encode"] = "none"
         costs.append(NamedProfile(engine.name, profile, bounds))
     return costs
+
+
+def costs_of(settings: EstimateSettings, policy: Described | None) -> Iterator[tuple[str, NamedProfile]]:
+    """Yield the costs of a policy on each machine with each engine, beside the machine's title.
+
+    Without a policy, yield the costs of each profile of `settings.on`.
+    """
+    if policy is None:
+        for one in open_profiles(settings.results, settings.on):
+            yield one.title, one
+        return
+    for name in dict.fromkeys(settings.device):
+        for costs in computed(policy, DEVICES[name]):
+            yield DEVICES[name].title, costs
 
 
 @dataclass(frozen=True)

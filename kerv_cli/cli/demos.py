@@ -39,9 +39,8 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
             with stage("demonstrations") as advance:
                 manifest = record(config, folder, advance, actor)
     except KeyboardInterrupt:
-        raise Interrupted(
-            f"interrupted: finished episodes are kept in {folder}, the same command goes on there"
-        ) from None
+        kept = f"finished episodes are kept in {folder}, the same command goes on there"
+        raise Interrupted(f"interrupted: {kept}") from None
     rows = ((n, len(row.episodes), f"{row.mean_steps:.0f}", len(row.failed_seeds)) for n, row in manifest.tasks.items())
     print_table(("task", "episodes", "mean steps", "failed seeds"), rows, f"demonstrations in {folder}")
 

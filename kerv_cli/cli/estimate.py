@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
 
 from kerv_cli.bench.settings import EstimateSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, end_with_json, print_rows
-
-if TYPE_CHECKING:
-    from kerv_cli.bench.described import Described
-    from kerv_cli.report.profiles import NamedProfile
 
 
 @command(
@@ -31,7 +26,7 @@ def estimate(settings: EstimateSettings, as_json: AsJson = False) -> None:
         kerv estimate trace=FILE on=PROFILE
     """
     from kerv_cli.bench.described import described
-    from kerv_cli.bench.prices import NO_TOKENS, Estimate
+    from kerv_cli.bench.prices import NO_TOKENS, Estimate, costs_of
     from kerv_cli.bench.tables import document, family_rows, notes, part_rows, rate, sentence
 
     if settings.trace:
@@ -45,7 +40,7 @@ def estimate(settings: EstimateSettings, as_json: AsJson = False) -> None:
         return
     tokens = policy.tokens if policy else 7 if settings.tokens is None else settings.tokens
     found: dict[str, list[Estimate]] = {}
-    for title, costs in _costs(settings, policy):
+    for title, costs in costs_of(settings, policy):
         costs.check(tokens)
         found.setdefault(title, []).append(Estimate(costs, tokens))
     rows = []
@@ -54,39 +49,26 @@ def estimate(settings: EstimateSettings, as_json: AsJson = False) -> None:
         row["notes"] = notes(policy, estimates)
         if settings.hz:
             row["rate"] = rate(estimates, settings.hz, settings.actions)
-        rows.append(row | {"sentence": sentence(estimates)})
-    if as_json:
-        end_with_json({"applies": True, "machines": rows})
-    for row, (title, estimates) in zip(rows, found.items(), strict=True):
+        row["sentence"] = sentence(estimates)
+        rows.append(row)
+        if as_json:
+            continue
         if policy and policy.shape:
             engines = " / ".join(one.costs.name for one in estimates)
             title = f"{policy.shape.name} on {title}, computed, not measured: {engines}"
         print_rows(part_rows(estimates), title)
         print_rows(family_rows(estimates), "speed against AR; break-even: accepted tokens per verification")
-        for line in (*row["notes"], row.get("rate"), row["sentence"]):
-            if line:
-                typer.echo(line)
-
-
-def _costs(settings: EstimateSettings, policy: Described | None) -> Iterator[tuple[str, NamedProfile]]:
-    """Yield the costs on each machine with each engine, or of each profile, beside the machine's title."""
-    from kerv_cli.bench.physics import DEVICES
-    from kerv_cli.bench.prices import computed
-    from kerv_cli.report.profiles import open_profiles
-
-    if policy is None:
-        for one in open_profiles(settings.results, settings.on):
-            yield one.title, one
-        return
-    for name in dict.fromkeys(settings.device):
-        for costs in computed(policy, DEVICES[name]):
-            yield DEVICES[name].title, costs
+        for line in filter(None, (*row["notes"], row.get("rate"), row["sentence"])):
+            typer.echo(line)
+    if as_json:
+        end_with_json({"applies": True, "machines": rows})
 
 
 def _trace(settings: EstimateSettings, as_json: bool) -> None:
     """Price a trace on each machine, or say which length of chains would have been the fastest there."""
     from kerv_cli.base.paths import as_path
     from kerv_cli.bench.described import described
+    from kerv_cli.bench.prices import costs_of
     from kerv_cli.bench.tables import trace_row
     from kerv_cli.bench.trace import CANNOT, choose_length, price, read_trace
 
@@ -94,7 +76,7 @@ def _trace(settings: EstimateSettings, as_json: bool) -> None:
     settings.prompt = settings.prompt or next(filter(None, [one.prompt for one in trace]), None)
     answer = choose_length if settings.choose == "draft" else price
     documents, rows = [], []
-    for title, costs in _costs(settings, None if settings.on else described(settings)):
+    for title, costs in costs_of(settings, None if settings.on else described(settings)):
         machine = {"machine": title, "engine": costs.name}
         for one in answer(trace, costs):
             documents.append(machine | one)
