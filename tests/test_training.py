@@ -29,8 +29,8 @@ from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.losses import soft_labels, token_loss
 from kerv_cli.training.fit import Metrics, Progress, Save, batches, fit, read_state
-from kerv_cli.training.imitation import Imitation, lit, vocabulary, waypoints_of
 from kerv_cli.training.settings import TrainSettings
+from kerv_cli.training.target import Imitation, lit, vocabulary, waypoints_of
 from kerv_cli.worlds.demos.files import DemoEpisode
 from kerv_cli.worlds.metaworld.spec import SPEC
 

@@ -25,9 +25,8 @@ from kerv_cli.training.dagger import PolicyActs
 from kerv_cli.training.demonstrations import open_demos
 from kerv_cli.training.drafter import train_drafter
 from kerv_cli.training.fit import batches, identity_of
-from kerv_cli.training.imitation import task_weights
 from kerv_cli.training.settings import DemosSettings, TrainDrafterSettings, TrainSettings, TrainTargetSettings
-from kerv_cli.training.target import train_target
+from kerv_cli.training.target import task_weights, train_target
 from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, DemoEntry
 from kerv_cli.worlds.demos.files import DemoEpisode

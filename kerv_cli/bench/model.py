@@ -26,8 +26,8 @@ from kerv_cli.targets.compact.program import stored_bytes
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import Layer
-from kerv_cli.training.imitation import vocabulary
 from kerv_cli.training.settings import TrainTargetSettings
+from kerv_cli.training.target import vocabulary
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 _SPARE = 1.15  # free memory that is needed, relative to the weights: also for encoder, caches, a copy of one layer

@@ -105,12 +105,9 @@ def calibrate(
     chosen = choose_episodes(dataset, tasks, settings.episodes)
     method = Method.of(RolloutSettings(**{kind: find(kind, name).default for kind, name in DRAFTS.items()}))
     method.check(target)
-    no_drafter = [kind for kind in method.needs if not artifacts.exists(kind)]
-    missing = [*no_drafter]
-    if artifacts.exists("datastore"):
+    missing = [kind for kind in ("drafter", "datastore") if not artifacts.exists(kind)]
+    if "datastore" not in missing:
         artifacts.check(["datastore"])
-    else:
-        missing.append("datastore")
     old: Calibration | None = artifacts.load("calibration") if settings.complete else None
     # a shipped calibration may be completed, and skip levels may be added to it
     path = artifacts.path("calibration")
@@ -126,15 +123,17 @@ def calibrate(
     stage = begin("calibration", path.parent, f"{path}: {plan}", 0)
 
     with stage("reading demonstrations") as progress:
-        windows = read_windows(dataset, chosen, target.actions, settings.window, target.chunk, progress)
+        past, future, paths, counts = read_windows(
+            dataset, chosen, target.actions, settings.window, target.chunk, progress
+        )
     variability: dict[str, Variability] = {}
     notes: list[str] = []
-    if settings.decodes and not no_drafter:
+    if settings.decodes and "drafter" not in missing:
         decoder = method.decoder(artifacts.target, artifacts.load)
         with stage("pre-sampling") as progress:
             variability = presample(decoder, dataset, chosen, tasks, settings.decodes, progress)
     else:
-        without = "".join(f", no {kind}" for kind in no_drafter)
+        without = ", no drafter" if "drafter" in missing else ""
         notes.append(f"no reference levels K_S: decodes={settings.decodes}{without}")
     skip = None
     if "datastore" not in missing:
@@ -143,12 +142,12 @@ def calibrate(
     if skip is None:
         notes.append("no skip levels: no datastore of these tasks (kerv build datastore)")
     with stage("boundary ranges") as progress:
-        boundary = fit_boundary(windows.paths, settings.boundary_windows, old, progress)
+        boundary = fit_boundary(paths, settings.boundary_windows, old, progress)
     with stage("fitting the predictors"):
-        noise = fit_filters(windows)
+        noise = fit_filters(past, future)
     calibration = Calibration(
         target=MadeFor.of(target),
-        demos=Demonstrations(dataset.sha256, {task: {"training": n} for task, n in windows.episodes.items()}),
+        demos=Demonstrations(dataset.sha256, counts),
         window=settings.window,
         noise=noise,
         variability=variability,
@@ -215,9 +214,9 @@ def reference_level(records: Sequence[DecodeRecord], actions: ActionSpace, chunk
     bin_width, moving = 2.0 / actions.tokens, chunk * int((~actions.is_strict).sum())
     levels = {}
     for measure in MEASURES:
-        found = [variability(record.rounds, actions, measure) for record in records]
-        known = [level for level in found if level is not None]
-        median = float(np.median(known)) if known else 0.0  # no draft token counts
+        found = np.array([variability(record.rounds, actions, measure) for record in records], dtype=float)
+        known = found[~np.isnan(found)]  # NaN: no draft token counts
+        median = float(np.median(known)) if len(known) else 0.0
         levels[measure.name] = max(median, bin_width if measure.total else bin_width / moving)
     return Variability(levels[MEAN.name], len(records), levels)
 
@@ -296,16 +295,6 @@ def completed(old: Calibration, new: Calibration) -> Calibration:
     )
 
 
-@dataclass(frozen=True)
-class Windows:
-    """The expert's normalised actions before and after n moments (control steps) of the demonstrations."""
-
-    past: np.ndarray  # (n, window, D), D DoFs
-    future: np.ndarray  # (n, H, D), H control steps
-    episodes: dict[str, int]  # task -> number of episodes
-    paths: list[np.ndarray]  # end effector in each episode, (T, 3) metres
-
-
 def episode_windows(episode: DemoEpisode, actions: ActionSpace, window: int, horizon: int) -> np.ndarray:
     """Cut an episode into windows, one around each control step (moment) that has `window` control steps before it.
 
@@ -330,38 +319,37 @@ def episode_windows(episode: DemoEpisode, actions: ActionSpace, window: int, hor
 
 
 def read_windows(
-    dataset: DemoDataset,
-    chosen: Sequence[int],
-    actions: ActionSpace,
-    window: int,
-    horizon: int,
-    progress: OnProgress,
-) -> Windows:
-    """Read the windows of the chosen episodes.
+    dataset: DemoDataset, chosen: Sequence[int], actions: ActionSpace, window: int, horizon: int, progress: OnProgress
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], dict[str, dict[str, int]]]:
+    """Read the windows of the chosen episodes: the expert's actions around n moments (control steps).
 
     Args:
         dataset: The demonstrations.
         chosen: Indices of the episodes in the dataset.
         actions: The action space, to normalise actions.
         window: Number of control steps before each moment.
-        horizon: Number of control steps after each moment.
+        horizon: Number H of control steps after each moment.
         progress: Called with two numbers: episodes read, all episodes.
+
+    Returns:
+        Normalised actions of D DoFs before each moment (n, window, D) and after it (n, H, D); the end effector's
+        positions in each episode, (T, 3) metres; and the number of episodes of each task, as in `Demonstrations`.
 
     Raises:
         KervError: A task has no episode that is longer than the window.
     """
-    counts: dict[str, int] = {}
+    counts: dict[str, dict[str, int]] = {}
     parts, paths = [], []
     for done, index in enumerate(chosen, 1):
         episode = dataset.load(index)
         parts.append(episode_windows(episode, actions, window, horizon))
         paths.append(episode.end_effector.copy())
-        counts[episode.task] = counts.get(episode.task, 0) + bool(len(parts[-1]))
+        counts.setdefault(episode.task, {"training": 0})["training"] += bool(len(parts[-1]))
         progress(done, len(chosen))
-    if short := [task for task, count in counts.items() if not count]:
+    if short := [task for task, number in counts.items() if not number["training"]]:
         raise KervError(f"{', '.join(short)}: no episode is longer than a window of {window}")
     around = np.concatenate(parts)
-    return Windows(around[:, :window], around[:, window:], counts, paths)
+    return around[:, :window], around[:, window:], paths, counts
 
 
 def choose_episodes(dataset: DemoDataset, tasks: Sequence[str], limit: int) -> list[int]:
@@ -407,16 +395,17 @@ def fit_noise(past: np.ndarray, future: np.ndarray, dampings: Sequence[float]) -
     return q, damping
 
 
-def fit_filters(windows: Windows) -> dict[str, Noise]:
+def fit_filters(past: np.ndarray, future: np.ndarray) -> dict[str, Noise]:
     """Fit the Kalman filters `kalman` and `damped`.
 
     Args:
-        windows: The actions before each moment, and the actions after it, which the filters should predict.
+        past: (n, window, D) normalised actions before each moment.
+        future: (n, H, D) normalised actions after each moment, which the filters should predict.
 
     Returns:
         For each filter's name, the noise and damping per DoF, strict DoFs included.
     """
-    past, future, noise = windows.past, windows.future, {}
+    noise = {}
     for kind in FILTERS:
         dampings = DAMPINGS if kind == "damped" else (1.0,)
         fits = [fit_noise(past[..., dof], future[..., dof], dampings) for dof in range(past.shape[2])]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -38,7 +37,6 @@ from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.training.settings import Begin, BuildDatastoreSettings, quietly
 from kerv_cli.worlds import resolve_tasks
-from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.files import DemoEpisode
 
 BATCH = 128
@@ -76,41 +74,44 @@ def build_datastore(
     is_store = (folder / MANIFEST).is_file() and read_mapping(folder / MANIFEST).get("kind") == "datastore"
     if not is_store and (folder.is_file() or visible(folder)):
         raise UsageError(f"{folder} exists and is no datastore: give the new one another name")
-    chosen, seeds = first_episodes(dataset, tasks, settings.episodes)
+    chosen: dict[str, list[int]] = {}
+    seeds: dict[str, list[int]] = {}
+    number = steps = 0
+    for task in tasks:
+        by_seed = sorted(dataset.of_tasks(task), key=lambda index: dataset.episodes[index].seed)
+        chosen[task] = by_seed[: settings.episodes or None]
+        episodes = [dataset.episodes[index] for index in chosen[task]]
+        seeds[task] = [episode.seed for episode in episodes]
+        number, steps = number + len(episodes), steps + sum(episode.steps for episode in episodes)
     check_seeds(seeds, dataset.path)
-    indices = [*itertools.chain(*chosen.values())]
-    steps = sum(dataset.episodes[index].steps for index in indices)
     plan = (
-        f"{count(len(indices), 'demonstration')} of {count(len(tasks), 'task')}, {steps} control steps, through "
+        f"{count(number, 'demonstration')} of {count(len(tasks), 'task')}, {steps} control steps, through "
         f"{artifacts.folder}, keys from {' + '.join(settings.key)}"
     )
 
     stage = begin("datastore", folder, f"{folder}: {plan}", 0)
     parts: list[dict[str, np.ndarray]] = []
     shards: dict[str, Shard] = {}
-    rows, space = 0, dataset.manifest.observation
+    rows, target = 0, artifacts.description
     with stage("encoding demonstrations") as progress:
-        for name, episodes in chosen.items():
+        for name, indices in chosen.items():
             first = rows
-            for index in episodes:
-                parts.append(entries_of(artifacts.target, dataset.load(index), space, settings.key))
+            for index in indices:
+                episode, space = dataset.load(index), dataset.manifest.observation
+                parts.append(entries_of(artifacts.target, episode, space, settings.key))
                 rows += len(parts[-1]["step"])
-                progress(len(parts), len(indices))
+                progress(len(parts), number)
             shards[name] = Shard((first, rows), tuple(seeds[name]))
-    columns = {}
-    for name in parts[0]:
-        columns[name] = np.concatenate([part[name] for part in parts])
-    files = contents_of(columns, shards, settings.components, settings.half)
 
     def write(new: Path) -> None:
-        write_files(new, files)
-        target = artifacts.description
+        width = write_files(new, parts, settings)
+        files = [name for name in (PROJECTION, VECTORS, PAYLOAD) if (new / name).exists()]
         manifest = Manifest(
             format=2,
             kind="datastore",
             key=tuple(settings.key),
-            width=files[VECTORS].shape[1],
-            rows=len(files[VECTORS]),
+            width=width,
+            rows=rows,
             chunk=target.chunk,
             actions=target.actions,
             target=target.sha256,
@@ -122,25 +123,7 @@ def build_datastore(
         write_json(new / MANIFEST, asdict(manifest))
 
     write_folder(folder, write)
-    return folder, Datastore.open(folder, artifacts.description)
-
-
-def first_episodes(
-    dataset: DemoDataset, tasks: Sequence[str], limit: int
-) -> tuple[dict[str, list[int]], dict[str, list[int]]]:
-    """Return two dicts by task: the indices of the episodes with the lowest seeds, and these seeds.
-
-    Args:
-        dataset: The demonstrations.
-        tasks: Full names of the tasks.
-        limit: Maximum number of episodes per task; 0: all.
-    """
-    chosen, seeds = {}, {}
-    for task in tasks:
-        by_seed = sorted(dataset.of_tasks(task), key=lambda index: dataset.episodes[index].seed)
-        chosen[task] = by_seed[: limit or None]
-        seeds[task] = [dataset.episodes[index].seed for index in chosen[task]]
-    return chosen, seeds
+    return folder, Datastore.open(folder, target)
 
 
 @torch.inference_mode()
@@ -163,6 +146,7 @@ def entries_of(target: Any, episode: DemoEpisode, space: ObservationSpace, key: 
     size = -(-len(steps) // -(-len(steps) // BATCH))  # equal batches
     keys = [prompt_key(prompt, target, key).cpu().numpy() for prompt in prompts_of(target, observations, size)]
     return {
+        "task": np.full(len(steps), episode.task),
         "seed": np.full(len(steps), episode.seed),
         "step": steps.astype(np.int64),  # control steps since the start
         "left": episode.steps - steps,  # control steps until the success
@@ -171,41 +155,33 @@ def entries_of(target: Any, episode: DemoEpisode, space: ObservationSpace, key: 
     }
 
 
-def contents_of(
-    columns: dict[str, np.ndarray], shards: Mapping[str, Shard], components: int, half: bool
-) -> dict[str, Any]:
-    """Return the content of each file of a datastore, an array or a table, by file name.
+def write_files(folder: Path, parts: Sequence[Mapping[str, np.ndarray]], settings: BuildDatastoreSettings) -> int:
+    """Write the files of a datastore into a folder, except the manifest. Return the width of a key.
 
     Args:
-        columns: The values of each column, one row per entry of all tasks.
-        shards: For each task the range of its rows, and the seeds of its episodes.
-        components: Number of directions that the keys are projected onto; 0: no projection.
-        half: Whether keys are stored in float16.
+        folder: The folder.
+        parts: The entries of each episode, as `entries_of` returns them.
+        settings: Settings of `kerv build datastore`.
     """
-    keys, tokens, files = columns.pop("keys"), columns.pop("tokens"), {}
-    if components:
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    keys, tokens, arrays = columns.pop("keys"), columns.pop("tokens"), {}
+    if settings.components:
         # the orthonormal directions that keep most of the keys' squared length
         values, vectors = np.linalg.eigh(keys.T.astype(np.float64) @ keys)
-        files[PROJECTION] = vectors[:, np.argsort(-values)[:components]].astype(np.float32)
-        keys = projected(keys, files[PROJECTION])
-    files[VECTORS] = keys.astype(np.float16 if half else np.float32)
-    counts = np.diff([shard.rows for shard in shards.values()])[:, 0]
-    task = np.repeat(np.arange(len(shards), dtype=np.int32), counts)
+        arrays[PROJECTION] = vectors[:, np.argsort(-values)[: settings.components]].astype(np.float32)
+        keys = projected(keys, arrays[PROJECTION])
+    arrays[VECTORS] = keys.astype(np.float16 if settings.half else np.float32)
+    # write to memory first: on a full disk, numpy and pyarrow raise errors without an errno
+    for name, array in arrays.items():
+        buffer = io.BytesIO()
+        np.save(buffer, array)
+        (folder / name).write_bytes(buffer.getbuffer())
     table = {
-        "task": pa.DictionaryArray.from_arrays(task, [*shards]),
+        "task": pa.array(columns.pop("task")).dictionary_encode(),
         **columns,
         "tokens": pa.FixedSizeListArray.from_arrays(pa.array(tokens.ravel()), tokens.shape[1]),
     }
-    return {**files, PAYLOAD: pa.table(table)}
-
-
-def write_files(folder: Path, files: Mapping[str, Any]) -> None:
-    """Write arrays and tables, given by file name, into a folder."""
-    for name, content in files.items():
-        # write to memory first: on a full disk, numpy and pyarrow raise errors without an errno
-        buffer = io.BytesIO()
-        if name == PAYLOAD:
-            pq.write_table(content, buffer, compression="zstd")
-        else:
-            np.save(buffer, content)
-        (folder / name).write_bytes(buffer.getbuffer())
+    buffer = io.BytesIO()
+    pq.write_table(pa.table(table), buffer, compression="zstd")
+    (folder / PAYLOAD).write_bytes(buffer.getbuffer())
+    return keys.shape[1]

@@ -44,23 +44,21 @@ def open_demos(database: Database, names: str, tasks: Sequence[str] = (), episod
     results, parts = str(database.results), names.split("+")
     if artifact_or_path(results, "demos", names).is_dir():  # its name may contain a plus
         parts = [names]
-    folders = [artifact_or_path(results, "demos", name) for name in parts]
-    return DemoDataset.joined([_opened(database, folder, tasks, episodes) for folder in folders])
-
-
-def _opened(database: Database, folder: Path, tasks: Sequence[str], episodes: int) -> DemoDataset:
-    """Open one dataset, or say how to record it; see `open_demos`."""
-    try:
-        return DemoDataset.open(folder)
-    except CheckpointError as error:
-        command = command_to_go_on(database, "demos", folder)
-        if command and not (folder / "manifest.json").exists():
-            line = shlex.join(["kerv", *command])
-            raise CheckpointError(f"the demonstrations in {folder} are unfinished: run '{line}'") from error
-        if folder.is_dir():
-            raise
-        remedy = _remedy(database.results / "artifacts/demos", folder, tasks, episodes)
-        raise CheckpointError(f"no demonstrations in {folder}: {remedy}") from error
+    opened = []
+    for name in parts:
+        folder = artifact_or_path(results, "demos", name)
+        try:
+            opened.append(DemoDataset.open(folder))
+        except CheckpointError as error:
+            command = command_to_go_on(database, "demos", folder)
+            if command and not (folder / "manifest.json").exists():
+                line = shlex.join(["kerv", *command])
+                raise CheckpointError(f"the demonstrations in {folder} are unfinished: run '{line}'") from error
+            if folder.is_dir():
+                raise
+            remedy = _remedy(database.results / "artifacts/demos", folder, tasks, episodes)
+            raise CheckpointError(f"no demonstrations in {folder}: {remedy}") from error
+    return DemoDataset.joined(opened)
 
 
 def _remedy(parent: Path, folder: Path, tasks: Sequence[str], episodes: int) -> str:

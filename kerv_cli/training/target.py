@@ -1,44 +1,60 @@
-"""`kerv train target`: train a compact policy by behaviour cloning."""
+"""`kerv train target`: train a compact policy by behaviour cloning.
+
+One sample is one recorded control step: the observation, and the expert's next H undisturbed actions. Validation uses
+held-out episodes. Two policies with the same token accuracy may differ widely in success. So with `train.closed_loop`,
+the success in simulated episodes decides which weights are best.
+
+Shapes: B samples of a batch, N tokens of a chunk, H control steps of a chunk, D degrees of freedom of an action.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import sys
-from dataclasses import asdict, replace
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from kerv_cli.base.codes import CODES
+from kerv_cli.base.codes import CODES, FastCode
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.paths import artifact, find_target
 from kerv_cli.base.runtime import set_up
+from kerv_cli.base.spaces import ActionSpace, Place
 from kerv_cli.episodes.runner import success_of
 from kerv_cli.lab.database import Database
-from kerv_cli.targets.checkpoint import load_target, read_target
+from kerv_cli.targets.checkpoint import TargetDescription, load_target, read_target
+from kerv_cli.targets.compact.features import places_of
 from kerv_cli.targets.compact.folder import save_target
+from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.targets.losses import labels_of, position_loss, token_loss
+from kerv_cli.targets.observations import Observations, read_chunks, read_observations, split
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_spaces, check_tasks, name_of, open_demos, seen_by
 from kerv_cli.training.fit import Metrics, batches, figures_of, fit, identity_of, refuse_other, without_subnormals
-from kerv_cli.training.imitation import (
-    WAYPOINTS,
-    Imitation,
-    Samples,
-    check_init,
-    continued_target,
-    load_samples,
-    vocabulary,
-)
-from kerv_cli.training.settings import Begin, TrainTargetSettings, quietly, refuse_unused
-from kerv_cli.worlds import resolve_tasks, settled, spec_of
+from kerv_cli.training.settings import Begin, TrainSettings, TrainTargetSettings, quietly, refuse_unused
+from kerv_cli.worlds import resolve_tasks, settled, spec_of, specs
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
+from kerv_cli.worlds.demos.files import DemoEpisode
 
 STATE_EPISODES = 200
 """Maximum number of episodes from which the range of the states is measured."""
+WITHIN = 9
+"""Validation reports the share of tokens at most this many bins from the label: Spec-VLA's acceptance radius."""
+WAYPOINTS = (Place("waypoint 1", 0), Place("waypoint 2", 0))
+"""Positions that a policy estimates if its demonstrations hold no object positions: where the hand will be when the
+gripper next changes, and at the end of the episode. No state contains them, so their index 0 is never used."""
+VALIDATED = 2048
+"""Maximum number of samples in a validation."""
 
 
 def train_target(settings: TrainTargetSettings, database: Database, begin: Begin = quietly) -> tuple[Path, Metrics]:
@@ -195,28 +211,24 @@ def load_training(
         CheckpointError: The demonstrations or the target `init` are damaged or of another environment.
     """
     manifest, shapes, old = dataset.manifest, settings.target, None
+    words, observation = vocabulary(manifest.environment), manifest.observation
     if init is not None:
         old, description = load_target(init)
         check_spaces(dataset, description.actions, description.observation, f"the target in {init}")
-    words, observation = vocabulary(manifest.environment), manifest.observation
-    if old is not None:
         words, observation = old.words, old.observation
     elif not observation.places:
         observation = observation.without_state(WAYPOINTS)
     waypoints = len(observation.places) if settings.train.places == "path" else 0
     samples = load_samples(dataset, shapes, words, tasks, progress, waypoints)
     torch.manual_seed(settings.train.seed)
-    if old is not None:
-        actions = old.actions
-    else:
+    if old is None:
         actions = manifest.actions.fitted(samples.chunks[:, 0].numpy().astype(np.float64))
-    if old is not None and (old.settings.code, old.chunk) == (shapes.code, shapes.chunk):
-        code = old.actions.code
-    else:
         code = CODES[shapes.code](actions.normalise(samples.chunks.numpy()))
-    if old is not None:
-        return continued_target(shapes, old, camera, code), samples
-    return CompactTarget(replace(shapes), replace(actions, code=code), observation, words, camera), samples
+        return CompactTarget(replace(shapes), replace(actions, code=code), observation, words, camera), samples
+    code = old.actions.code
+    if (old.settings.code, old.chunk) != (shapes.code, shapes.chunk):
+        code = CODES[shapes.code](old.actions.normalise(samples.chunks.numpy()))
+    return continued_target(shapes, old, camera, code), samples
 
 
 def state_range(dataset: DemoDataset) -> list[list[float]]:
@@ -225,7 +237,317 @@ def state_range(dataset: DemoDataset) -> list[list[float]]:
     The percentiles are measured on at most STATE_EPISODES episodes.
     """
     count = len(dataset.episodes)
-    chosen = range(0, count, -(-count // STATE_EPISODES))
-    states = np.concatenate([dataset.load(index).states for index in chosen])
+    states = np.concatenate([dataset.load(i).states for i in range(0, count, -(-count // STATE_EPISODES))])
     ends: list[list[float]] = np.percentile(states, [0.1, 99.9], axis=0).tolist()
     return ends
+
+
+@dataclass(frozen=True)
+class Samples(Observations):
+    """The n samples that a policy is trained on: observations and the expert's chunks."""
+
+    chunks: Tensor  # (n, H, D) float32, the expert's undisturbed actions, environment units
+    places: Tensor  # (n, K, 3) float32, the positions that the target learns to estimate, metres
+    episodes: Tensor  # (n,) int64, index of the sample's episode
+    tasks: Tensor  # (n,) int64, index of the sample's task
+
+
+def load_samples(
+    dataset: DemoDataset,
+    settings: TargetSettings,
+    words: WordTokenizer,
+    task_names: tuple[str, ...],
+    progress: OnProgress = lambda done, total: None,
+    waypoints: int = 0,
+) -> Samples:
+    """Read the episodes of some tasks into memory.
+
+    Args:
+        dataset: The demonstrations.
+        settings: Shapes of the target.
+        words: Tokenizer of the instructions.
+        task_names: Full names of the tasks.
+        progress: Called with two numbers: episodes read, all episodes.
+        waypoints: Number of later positions of the hand that the policy learns to estimate. 0: the policy learns the
+            positions of object and goal instead.
+
+    Raises:
+        CheckpointError: An episode has too few actions of the expert, or images of another size.
+    """
+    chosen = dataset.of_tasks(*task_names)
+    parts = []
+    for number, index in enumerate(chosen):
+        episode = dataset.load(index)
+        observations = read_observations(episode, settings, dataset.manifest.observation, words)
+        steps, count = observations.steps.numpy(), len(observations)
+        if waypoints:
+            learnt = waypoints_of(episode, steps, waypoints, dataset.manifest.actions)
+        else:
+            learnt = places_of(observations.states, dataset.manifest.observation)
+        parts.append(
+            Samples(
+                **vars(observations),
+                chunks=torch.from_numpy(read_chunks(episode, steps, settings.chunk)).float(),
+                places=learnt,
+                episodes=torch.full((count,), number),
+                tasks=torch.full((count,), task_names.index(episode.task)),
+            )
+        )
+        progress(number + 1, len(chosen))
+    return Samples.joined(parts)
+
+
+def waypoints_of(episode: DemoEpisode, steps: np.ndarray, count: int, actions: ActionSpace) -> Tensor:
+    """Return where the hand will be at the next gripper changes, and at the episode's end.
+
+    These positions come from the demonstration alone. No simulator state is needed. A gripper change is a control step
+    in which the expert's command of a strict DoF (the gripper) moves by more than an eighth of its range.
+
+    Args:
+        episode: A demonstration.
+        steps: (n,) control steps.
+        count: Number K of positions per step: those at the next K − 1 gripper changes and at the end. If fewer changes
+            follow, the position at the end fills the rest.
+        actions: The action space.
+
+    Returns:
+        (n, K, 3) float32, metres.
+    """
+    commands = episode.labels[: episode.steps, actions.is_strict]
+    changes = np.flatnonzero((abs(np.diff(commands, axis=0)) > actions.half[actions.is_strict] / 4).any(-1)) + 1
+    last = episode.steps - 1
+    times = np.append(changes, [last] * count)
+    first = np.searchsorted(changes, steps, side="right")
+    reached = np.concatenate([times[first[:, None] + np.arange(count - 1)], np.full((len(steps), 1), last)], 1)
+    return torch.from_numpy(episode.end_effector[reached]).float()
+
+
+def task_weights(tasks: Tensor, balance: float) -> Tensor | None:
+    """Return how likely each sample is to be drawn.
+
+    A task that has the share p of the samples is drawn in proportion to p^(1 − balance).
+
+    Args:
+        tasks: (n,) index of each sample's task.
+        balance: 0: all samples are equally likely. 1: all tasks are equally likely.
+
+    Returns:
+        (n,) float64 weights; None if all samples are equally likely.
+    """
+    if balance == 0:
+        return None
+    shares = torch.bincount(tasks).double() / len(tasks)
+    weights: Tensor = shares[tasks] ** -balance
+    return weights
+
+
+def lit(images: Tensor, indices: Tensor, step: int, spread: float) -> Tensor:
+    """Change the light on images at random, as data augmentation.
+
+    Each colour channel is multiplied by the exponential of a smooth random field. The field's standard deviation is
+    drawn uniformly from 0 to `spread` for each image.
+
+    Args:
+        images: (B, 3, h, w) uint8.
+        indices: (B,) indices of the samples. With `step`, they determine the random fields.
+        step: The optimisation step.
+        spread: Largest standard deviation of the field.
+
+    Returns:
+        (B, 3, h, w) uint8.
+    """
+    fields = []
+    for index in indices.tolist():
+        random = np.random.default_rng((step, index))
+        fields.append(spread * random.uniform() * random.normal(size=(3, 3, 3)))
+    factors = torch.from_numpy(np.stack(fields)).float().to(images.device).exp()
+    light = F.interpolate(factors, images.shape[-2:], mode="bilinear", align_corners=True)
+    return (images * light).round_().clamp_(0, 255).to(torch.uint8)
+
+
+class Imitation:
+    """A target's samples, its loss and its validation.
+
+    Args:
+        target: The network to train, already on its device.
+        samples: All samples. Some whole episodes are held out for validation.
+        settings: Optimisation settings.
+        closed_loop: Runs simulated episodes and returns a target's success in [0, 1], which then dominates the score.
+            None: success is not measured.
+    """
+
+    def __init__(
+        self,
+        target: CompactTarget,
+        samples: Samples,
+        settings: TrainSettings,
+        closed_loop: Callable[[CompactTarget], float] | None = None,
+    ) -> None:
+        self.module, self.settings, self.device, self.closed_loop = target, settings, target.device, closed_loop
+        self.training, self.held_out = split(samples, settings.held_out)
+        self.labels = labels_of(target.actions, settings.label_sigma).to(self.device)
+        self.weights = task_weights(self.training.tasks, settings.balance)
+        self.learns_places = bool(target.cameras and settings.scene_weight)
+
+    def tokens(self, batch: Samples) -> Tensor:
+        """Return the action tokens (B, n) int64 of B samples, on the target's device.
+
+        n is N, or less if all chunks end earlier, by an end token.
+        """
+        tokens = self.module.actions.chunk_tokens(batch.chunks.numpy())
+        lengths = (tokens != self.module.actions.end).sum(1) + 1
+        return torch.from_numpy(tokens[:, : lengths.max()]).to(self.device)
+
+    @contextlib.contextmanager
+    def precision(self) -> Iterator[None]:
+        """Compute in bfloat16 inside this context, if `train.bf16` is set and the device multiplies bfloat16 numbers.
+
+        GPUs do, and CPUs with AMX or AVX512-BF16. Other CPUs are slower in bfloat16. On a CPU, attention then runs
+        without a fused kernel, because the fused kernel's backward pass takes four times as long.
+        """
+        gpu = self.device.type != "cpu"
+        multiplies = gpu or torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported()
+        bf16 = self.settings.bf16 and multiplies
+        kernels = [SDPBackend.MATH]
+        if gpu or not bf16:
+            kernels += [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION]
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16), sdpa_kernel(kernels):
+            yield
+
+    def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
+        """Return the loss of a batch, and the metrics to log.
+
+        The loss is the token loss plus `train.scene_weight` times the position loss. The position loss measures
+        the errors of the positions, such as object and goal, that a target with cameras estimates. In the first
+        `train.scene_steps` steps the loss is the position loss alone. A target without cameras has only the token loss.
+
+        Args:
+            indices: (B,) indices of the samples.
+            step: The optimisation step.
+        """
+        batch = self.training.where(indices)
+        inputs = batch.inputs(self.device)
+        if self.settings.colour and inputs.images is not None:
+            inputs = replace(inputs, images=lit(inputs.images, indices, step, self.settings.colour))
+        with self.precision():
+            places = batch.places.to(self.device)
+            if self.learns_places and step < self.settings.scene_steps:
+                loss = position_loss(self.module.encode_batch(inputs)[1], places)
+                return loss, {"position_loss": float(loss.detach())}
+            tokens = self.tokens(batch)
+            logits, positions = self.module.teacher_forced(inputs, tokens)
+            loss = token_loss(logits, tokens, self.labels)
+            metrics = {"token_loss": float(loss.detach())}
+            if self.learns_places:
+                of_places = position_loss(positions, places)
+                loss = loss + self.settings.scene_weight * of_places
+                metrics["position_loss"] = float(of_places.detach())
+        return loss, metrics
+
+    @torch.no_grad()
+    def validate(self, module: nn.Module) -> Metrics:
+        """Return metrics on the held-out episodes, with teacher forcing.
+
+        The score is minus the mean absolute error of the actions. If closed-loop success is measured, ten times the
+        success is added.
+        """
+        assert isinstance(module, CompactTarget)
+        chosen = torch.linspace(0, len(self.held_out) - 1, min(VALIDATED, len(self.held_out))).long()
+        distances, gaps, offsets = [], [], []
+        actions = module.actions
+        for indices in chosen.split(256):
+            batch = self.held_out.where(indices)
+            tokens = self.tokens(batch)
+            logits, positions = module.teacher_forced(batch.inputs(self.device), tokens)
+            guess = logits.argmax(-1)
+            distances.append((guess - tokens).abs().flatten())
+            for guessed, expert in zip(guess.tolist(), tokens.tolist(), strict=True):
+                values = actions.chunk_values(guessed, module.chunk)
+                gaps.append(np.abs(values - actions.chunk_values(expert, module.chunk)))
+            offsets.append((positions - batch.places.to(self.device)).norm(dim=-1))
+        distance, error = torch.cat(distances), np.concatenate(gaps).mean(0)
+        metrics = {
+            "score": -float(error.mean()),
+            "token_accuracy": float((distance == 0).float().mean()),
+            f"within_{WITHIN}": float((distance <= WITHIN).float().mean()),
+            "action_l1": float(error.mean()),
+        }
+        for name, one in zip(actions.names, error, strict=True):
+            metrics[f"l1_{name}"] = float(one)
+        if self.learns_places:
+            medians = torch.cat(offsets).median(0).values.tolist()
+            for number, place in enumerate(module.observation.places):
+                of_path = self.settings.places == "path"
+                name = f"waypoint_{number + 1}" if of_path else place.name.replace(" ", "_")
+                metrics[f"{name}_error_cm"] = 100 * medians[number]
+        if self.closed_loop is not None:
+            metrics["closed_loop_success"] = self.closed_loop(module)
+            metrics["score"] += 10 * metrics["closed_loop_success"]
+        return metrics
+
+
+def check_init(settings: TargetSettings, camera: str, description: TargetDescription, folder: Path) -> None:
+    """Refuse initial weights whose shapes differ from the new target's.
+
+    Only the settings `size`, `chunk`, `code`, `norm` and `parallel` may differ. The new target may see further views
+    after the old ones.
+
+    Args:
+        settings: Shapes of the new target.
+        camera: Camera of the new target. Several views are joined by `+`.
+        description: Description of the target with the initial weights.
+        folder: Folder of the target with the initial weights, for the error message.
+
+    Raises:
+        UsageError: A shape or the camera differs. The message names the first difference.
+    """
+    for name, value in asdict(settings).items():
+        stored = description.settings.get(name)
+        if name not in ("size", "chunk", "code", "parallel", "norm") and stored != value:
+            raise UsageError(
+                f"train.init: the target in {folder} has {name}={stored}, the run target.{name}={value}: set both alike"
+            )
+    trained = description.cameras[0] if description.cameras else ""
+    if settings.observation == "vision" and not f"{camera}+".startswith(f"{trained}+"):
+        raise UsageError(
+            f"train.init: the target in {folder} sees {trained}, the run {camera}: world.camera.name must be "
+            f"{trained}, or begin with {trained}+"
+        )
+
+
+def continued_target(
+    settings: TargetSettings, init: CompactTarget, camera: str, code: FastCode | None = None
+) -> CompactTarget:
+    """Make a target that starts from the weights, action statistics and words of another target.
+
+    The query embeddings of a parallel target are newly initialised. So are embedding and head, if the tokens differ.
+    The encoder of an added view is a copy of the first view's. The weights from an added view to the estimated object
+    positions start at zero.
+
+    Args:
+        settings: Shapes of the new target.
+        init: The target with the initial weights.
+        camera: Camera of the new target. Several views are joined by `+`.
+        code: Code of the new target's chunks. None: a token for every number.
+    """
+    actions = replace(init.actions, code=code)
+    target = CompactTarget(replace(settings), actions, init.observation, init.words, camera)
+    new, old = target.state_dict(), init.state_dict()
+    kept = old.keys() if actions == init.actions else old.keys() - {"embedding.weight", "head.weight"}
+    weights = new | {name: old[name] for name in kept & new.keys()}
+    if target.cameras:
+        for view in range(len(init.encoders) - 1, len(target.encoders) - 1):
+            for name, value in init.vision.state_dict().items():
+                weights[f"further_views.{view}.{name}"] = value
+        points = 2 * settings.keypoints * len(init.encoders)
+        added = 2 * settings.keypoints * len(target.encoders) - points
+        weight = weights["locate.0.weight"]
+        columns = [weight[:, :points], weight.new_zeros(len(weight), added), weight[:, points:]]
+        weights["locate.0.weight"] = torch.cat(columns, 1)
+    target.load_state_dict(weights)
+    return target
+
+
+def vocabulary(environment: str) -> WordTokenizer:
+    """Return a word tokenizer whose vocabulary is all words in the instructions of an environment's tasks."""
+    return WordTokenizer.build(t.instruction for t in specs()[environment].tasks.values())
