@@ -17,7 +17,7 @@ from kerv_cli.engine.record import PHASES, DecodeRecord, EpisodeRecord, Round
 from kerv_cli.methods.kerv import CompensateSettings, Compensation
 from kerv_cli.methods.kerv.prediction import Hold, PredictionProposer
 from kerv_cli.methods.spec_vla import RelaxedRule
-from kerv_cli.methods.streak import AlwaysSkip
+from kerv_cli.methods.unverified import AlwaysSkip
 from kerv_cli.report.viewing.viewer import read_chunks
 from kerv_cli.worlds.metaworld.spec import SPEC
 

@@ -33,8 +33,7 @@ from kerv_cli.lab.store import Study
 from kerv_cli.lab.work import EpisodeRunner, RunEpisode
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
-from kerv_cli.methods.parallel import ParallelPass
-from kerv_cli.methods.streak import AlwaysSkip
+from kerv_cli.methods.unverified import AlwaysSkip, ParallelPass
 from kerv_cli.report.plots import study_figures
 from kerv_cli.report.profiles import NamedProfile
 from kerv_cli.report.reprice import repriced

@@ -21,12 +21,12 @@ from kerv_cli.base.registry import find
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.contact import Contact, ContactThresholdSettings
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early.drafter import EarlyDrafter
-from kerv_cli.methods.parallel import ParallelPass
+from kerv_cli.methods.kerv import Contact, ContactThresholdSettings
 from kerv_cli.methods.settings import PolicySettings
+from kerv_cli.methods.unverified import ParallelPass
 from kerv_cli.targets.attention import CapturedCache, attention_mask, bucket
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.compilable import compile_parts
@@ -38,8 +38,8 @@ from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Trunk
 from kerv_cli.targets.grown import grow_stack
 from kerv_cli.targets.settings import GrowSettings
-from kerv_cli.training.imitation import check_init, continued_target
 from kerv_cli.training.settings import TrainTargetSettings
+from kerv_cli.training.target import check_init, continued_target
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 ARM = ObservationSpace(

@@ -22,10 +22,10 @@ from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 from kerv_cli.methods import heisd
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.eagle import DrafterProposerSettings
-from kerv_cli.methods.jacobi import JacobiProposerSettings
 from kerv_cli.methods.kerv import CompensateSettings, KinematicThresholdSettings
-from kerv_cli.methods.sp_vla import SpeedSkipSettings
+from kerv_cli.methods.reuse import JacobiProposerSettings
 from kerv_cli.methods.spec_vla import FixedThresholdSettings, RelaxedAcceptanceSettings
+from kerv_cli.methods.unverified import SpeedSkipSettings
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.worlds.metaworld.spec import SPEC
 

@@ -11,7 +11,7 @@ from kerv_cli.bench.model import open_model
 from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.eagle.drafter import DrafterProposer
-from kerv_cli.methods.jacobi import JacobiProposer
+from kerv_cli.methods.reuse import JacobiProposer, JacobiProposerSettings
 from kerv_cli.targets.attention import CapturedCache
 from kerv_cli.targets.compact.trunk import Trunk
 
@@ -38,13 +38,17 @@ def test_strict_methods_decode_the_baselines_tokens():
     model = open_model(BenchSettings(target="nano", dtype="float32", runtime=RuntimeSettings(device="cuda")))
     autoregressive = Decoder(model.target).decode(model.observation)
     assert sum(autoregressive.phases.values()) == pytest.approx(autoregressive.seconds, rel=0.2)
-    for proposer in (JacobiProposer(), DrafterProposer(model.drafter, model.target, 5, 3, 12)):
+    for proposer in (JacobiProposer(JacobiProposerSettings()), DrafterProposer(model.drafter, model.target, 5, 3, 12)):
         assert Decoder(model.target, Parts(proposer=proposer)).decode(model.observation).tokens == autoregressive.tokens
 
 
 def test_a_round_waits_once():
     model = open_model(BenchSettings(target="nano", dtype="float32", runtime=RuntimeSettings(device="cuda")))
-    for proposer in (None, JacobiProposer(), *(DrafterProposer(model.drafter, model.target, 5, k, 9) for k in (1, 3))):
+    for proposer in (
+        None,
+        JacobiProposer(JacobiProposerSettings()),
+        *(DrafterProposer(model.drafter, model.target, 5, k, 9) for k in (1, 3)),
+    ):
         decoder = Decoder(model.target, Parts(proposer=proposer))
         decoder.decode(model.observation)  # captures its graphs, which waits
         torch.cuda.set_sync_debug_mode("warn")

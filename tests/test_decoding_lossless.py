@@ -23,7 +23,7 @@ from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter, EagleNetwork
-from kerv_cli.methods.jacobi import JacobiProposer
+from kerv_cli.methods.reuse import JacobiProposer, JacobiProposerSettings
 from kerv_cli.targets.compact.compilable import compile_parts
 from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
@@ -149,7 +149,7 @@ def test_strict_decoding_equals_ar(name, seed, layers, heads, chunk, nodes, insi
     prompt = random_prompt(target, seed)
     truth = plain_greedy(target, prompt)
     trees = RandomTrees(truth, seed, nodes, actions.tokens)
-    made = {"none": None, "trees": trees, "jacobi": JacobiProposer()}
+    made = {"none": None, "trees": trees, "jacobi": JacobiProposer(JacobiProposerSettings())}
     if name == "drafter":
         drawn = st.fixed_dictionaries({"layers": st.integers(1, 2), "final_norm": st.booleans()})
         settings = DrafterSettings(**data.draw(drawn, "the drafter"))

@@ -25,8 +25,8 @@ from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.losses import soft_labels, token_loss, within_chunk
 from kerv_cli.targets.observations import split
-from kerv_cli.training.imitation import load_samples
 from kerv_cli.training.settings import TrainDrafterSettings
+from kerv_cli.training.target import load_samples
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.metaworld.spec import SPEC
 

@@ -14,8 +14,8 @@ from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.tree import TokenTree
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.lookup import LookupProposer, LookupProposerSettings
 from kerv_cli.methods.motion import MotionRule
+from kerv_cli.methods.reuse import LookupProposer, LookupProposerSettings
 from kerv_cli.methods.settings import MethodSettings
 from kerv_cli.report.viewing.token_outcomes import chunk_size, outcomes_of, token_names
 

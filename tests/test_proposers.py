@@ -18,7 +18,14 @@ from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early.drafter import EarlyProposer
-from kerv_cli.methods.heisd import HybridProposer, Random, RetrievalProposer, SimilaritySkipSettings, VerifySkip
+from kerv_cli.methods.heisd import (
+    HybridProposer,
+    Random,
+    RandomBoundarySettings,
+    RetrievalProposer,
+    SimilaritySkipSettings,
+    VerifySkip,
+)
 from kerv_cli.methods.heisd.datastore import Datastore, prompt_key
 from kerv_cli.methods.kerv.prediction import Hold, Kalman, Linear, Noise, PredictionProposer
 from kerv_cli.methods.merged import MergedProposer
@@ -94,7 +101,7 @@ def test_every_proposer_is_lossless(name, seed, chunk, data):
     where = "after" if name == "hybrid" else data.draw(st.sampled_from(["after", "inside", "both"]), "where")
     before = None if where == "after" else known[name]
     after = {"after": known[name], "inside": None, "both": known["hybrid"]}[where]
-    boundary = Random(0.5) if after is known["hybrid"] else None
+    boundary = Random(RandomBoundarySettings()) if after is known["hybrid"] else None
     steps = data.draw(st.integers(0, chunk), "steps decoded, 0: all")
     decoder = Decoder(target, Parts(prefill_draft=before, proposer=after, boundary=boundary), chunk=steps)
     decoder.situation = situation(np.random.default_rng(seed), data.draw(st.integers(0, 12), "executed"))
@@ -195,7 +202,8 @@ def test_nothing_is_skipped_on_the_drafters_side():
     drafter = EagleDrafter().network(DrafterSettings(), decoder.target).eval().requires_grad_(False)
     drafting = DrafterProposer(drafter, decoder.target, depth=4, top_k=1, nodes=4)
     for p, forwards in ((0.0, True), (1.0, False)):
-        parts = Parts(proposer=HybridProposer(drafting, retrieval), boundary=Random(p), skip=decoder.parts.skip)  # type: ignore[arg-type]
+        boundary = Random(RandomBoundarySettings(p=p))
+        parts = Parts(proposer=HybridProposer(drafting, retrieval), boundary=boundary, skip=decoder.parts.skip)  # type: ignore[arg-type]
         hybrid = Decoder(decoder.target, parts)
         hybrid.situation = decoder.situation
         assert (hybrid.decode_prompt(prompt).forwards > 0) == forwards

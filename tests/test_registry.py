@@ -22,7 +22,7 @@ from kerv_cli.base.registry import (
     parts,
 )
 from kerv_cli.engine.parts import Skip
-from kerv_cli.methods.streak import AlwaysSkip, StreakSkip
+from kerv_cli.methods.unverified import AlwaysSkip, StreakSkip
 
 PLUGIN = """
 from dataclasses import dataclass

@@ -24,11 +24,11 @@ from kerv_cli.methods.artifacts import Use
 from kerv_cli.methods.certified import CertifiedSkipSettings, ScopedSettings, certified, scoped
 from kerv_cli.methods.certified.certificate import Candidate, Certificate, CertificateArtifact
 from kerv_cli.methods.context import Context
+from kerv_cli.methods.early import ScoutSettings
+from kerv_cli.methods.early.drafter import ScoutDrafter, ScoutNetwork, ScoutProposer, check_sees
 from kerv_cli.methods.merged import MergedProposerSettings
-from kerv_cli.methods.scout import ScoutSettings
-from kerv_cli.methods.scout.drafter import ScoutDrafter, ScoutNetwork, ScoutProposer, check_sees
 from kerv_cli.methods.settings import PolicySettings
-from kerv_cli.methods.streak import AlwaysSkip, StreakSkip, StreakSkipSettings
+from kerv_cli.methods.unverified import AlwaysSkip, StreakSkip, StreakSkipSettings
 from kerv_cli.report.betting import p_value, wealth
 from kerv_cli.report.certificate import folder_of
 from kerv_cli.targets.checkpoint import load_target

@@ -20,11 +20,11 @@ from kerv_cli.engine.parts import Boundary
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.episodes.settings import RolloutSettings
+from kerv_cli.methods.context import Context
 from kerv_cli.methods.heisd import RetrievalProposer, SimilaritySkipSettings, VerifySkip
 from kerv_cli.methods.kerv.prediction import Hold, PredictionProposer, Ridge
 from kerv_cli.methods.merged import MergedProposer
-from kerv_cli.methods.sp_vla import SpeedSkip, SpeedSkipSettings
-from kerv_cli.methods.streak import AlwaysSkip, StreakSkip, StreakSkipSettings
+from kerv_cli.methods.unverified import AlwaysSkip, SpeedSkip, SpeedSkipSettings, StreakSkip, StreakSkipSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 PAUSE = 0.03
@@ -254,8 +254,8 @@ class Counting(MockTarget):
 def played(speed: float, decodes: int, target: MockTarget, seeds: int = 1, **settings: Any) -> list[DecodeRecord]:
     """The decodes of episodes whose hand moves at `speed`, m/s, in every control step."""
     target_settings = SpeedSkipSettings(**settings)
-    ridge = Ridge(SPACE.is_strict, target_settings.penalty, target_settings.buffer, target.chunk)
-    decoder = Decoder(target, Parts(skip=SpeedSkip(target_settings, ridge)))
+    skip = SpeedSkip(target_settings, Context(target, None))  # type: ignore[arg-type]
+    decoder = Decoder(target, Parts(skip=skip))
     records = []
     for seed in range(seeds):
         hand = HOME.copy()
@@ -310,7 +310,8 @@ def test_an_intuitive_decode_runs_nothing_of_the_target():
 
 
 def decoder_of(source: Any, target: MockTarget, draft: Any = None, **settings: Any) -> Decoder:
-    skip = StreakSkip(StreakSkipSettings(**settings), source)
+    built = {"prefill_draft": draft or source}
+    skip = StreakSkip(StreakSkipSettings(**settings), Context(target, None, built=built))  # type: ignore[arg-type]
     made = Decoder(target, Parts(prefill_draft=draft or source, skip=skip))
     made.reset("t", 0, np.zeros(3))
     return made

@@ -20,10 +20,10 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter, EagleNetwork
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
-from kerv_cli.methods.heisd import HybridProposer, Random, RetrievalProposer
-from kerv_cli.methods.jacobi import JacobiProposer
+from kerv_cli.methods.heisd import HybridProposer, Random, RandomBoundarySettings, RetrievalProposer
 from kerv_cli.methods.kerv.prediction import Hold, Kalman, Noise, PredictionProposer
 from kerv_cli.methods.merged import MergedProposer
+from kerv_cli.methods.reuse import JacobiProposer, JacobiProposerSettings
 from kerv_cli.targets.compact.trunk import LayerStack
 
 CHUNK = 2
@@ -47,12 +47,12 @@ def parts_of(family: str, target: Any, prompt: torch.Tensor, truth: list[int]) -
         "ar": Parts(),
         "chain": Parts(proposer=chain),
         "tree": Parts(proposer=tree),
-        "jacobi": Parts(proposer=JacobiProposer()),
+        "jacobi": Parts(proposer=JacobiProposer(JacobiProposerSettings())),
         "hold": Parts(proposer=hold),
         "kalman": Parts(proposer=kalman),
         "retrieval": Parts(proposer=retrieval),
-        "hybrid, drafter": Parts(proposer=both, boundary=Random(0.0)),
-        "hybrid, retrieval": Parts(proposer=both, boundary=Random(1.0)),
+        "hybrid, drafter": Parts(proposer=both, boundary=Random(RandomBoundarySettings(p=0.0))),
+        "hybrid, retrieval": Parts(proposer=both, boundary=Random(RandomBoundarySettings(p=1.0))),
         "hold in the prefill": Parts(prefill_draft=hold),
         "early": Parts(prefill_draft=early),
         "merged": Parts(prefill_draft=merged),

@@ -35,8 +35,7 @@ from kerv_cli.engine.tree import ROOT
 from kerv_cli.episodes.policy import decoder_for
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer
-from kerv_cli.methods.early.drafter import EarlyProposer
-from kerv_cli.methods.scout.drafter import ScoutProposer
+from kerv_cli.methods.early.drafter import EarlyProposer, ScoutProposer
 from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.targets.compact.program import stored_bytes
 from kerv_cli.targets.provenance import stamp

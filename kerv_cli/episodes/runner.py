@@ -26,7 +26,7 @@ from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
 from kerv_cli.episodes.episode import episode, run_episode
 from kerv_cli.episodes.policy import clock_for, decoder_for, method_decoder
 from kerv_cli.episodes.settings import RolloutSettings
-from kerv_cli.methods.parallel import native_decoder
+from kerv_cli.methods.unverified import native_decoder
 from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.settings import CameraSettings, WorldSettings
 from kerv_cli.worlds.spec import World

@@ -3,17 +3,14 @@
     ar                          autoregressive decoding (AR): no drafts
     spec_vla                    Spec-VLA: accept a draft token if it is equal, or within a radius of the target's
     eagle                       EAGLE-2: drafters that read the target's hidden states, our own and published ones
+    early                       ours: the early drafter and the scout draft a chunk before the prefill
     kerv                        KERV: predictions from the motion, and thresholds that follow the motion
-    contact                     ours: a threshold that shrinks near the object
+    unverified                  OpenVLA-OFT's parallel pass, SP-VLA's regression; ours: streaks of drafts
     heisd                       HeiSD: retrieved drafts, a boundary between two drafters, skipped verification
-    jacobi, parallel            decoding as in PD-VLA and in OpenVLA-OFT
-    lookup                      prompt lookup in the last chunk's tokens
+    reuse                       Jacobi decoding as in PD-VLA, and prompt lookup in the last chunk's tokens
+    merged                      ours: several drafts in one tree, before the prefill (`method=one_pass`)
     motion                      ours: acceptance and stopping for FAST tokens, by the motion that they stand for
-    early, merged               ours: drafts from the prompt, before the prefill (`method=one_pass`)
-    scout                       ours: a drafter with its own vision encoder
-    streak                      ours: drafts that are executed without verification
     certified                   ours: unverified drafts, on tasks for which a certificate limits the loss of success
-    sp_vla                      SP-VLA: a regression replaces the target while the motion is fast
 
 Each file above, and the `__init__.py` of each folder, contains the parts of its family, with their settings. Importing
 these files imports neither torch nor numpy. Code that needs torch or numpy, such as a drafter's network, is in another
@@ -30,5 +27,5 @@ from __future__ import annotations
 
 # importing a family registers its parts; this is their order in error messages and help texts
 # isort: off
-from kerv_cli.methods import ar, spec_vla, eagle, early, scout, calibrated, kerv, parallel, streak  # noqa: F401
-from kerv_cli.methods import sp_vla, contact, heisd, jacobi, lookup, merged, motion, certified  # noqa: F401
+from kerv_cli.methods import ar, spec_vla, eagle, early, kerv, unverified, heisd, reuse  # noqa: F401
+from kerv_cli.methods import merged, motion, certified  # noqa: F401

@@ -72,23 +72,6 @@ class MadeFor:
         """Return what identifies the target with this description."""
         return cls(target.origin["sha256"], target.actions, target.chunk)
 
-    def check_same(self, target: MadeFor, what: str, made: str, again: str) -> None:
-        """Refuse an artifact that was made for another target than the policy's.
-
-        Args:
-            target: The policy's target.
-            what: Name of the artifact, for the error message.
-            made: How the artifact was made, such as `trained`, for the error message.
-            again: What the user should do, for the error message, such as `run 'kerv calibrate' again`.
-
-        Raises:
-            CheckpointError: The action space, its normalisation, the chunk length or the weights differ.
-        """
-        self.actions.check_same(target.actions, what, "the target", statistics=True)
-        if self.chunk and self.chunk != target.chunk:
-            raise CheckpointError(f"{what} was {made} for chunks of {self.chunk} steps, not of {target.chunk}: {again}")
-        check_sources({TARGET: self.sha256}, {TARGET: target.sha256}, f"{what} was {made}", again)
-
 
 def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str, again: str) -> None:
     """Refuse an artifact that was made from other versions of the policy's target or artifacts.
@@ -233,12 +216,16 @@ class Artifact(Generic[T]):
         """Read the description of the artifact in `path`, and check that it was made for this target.
 
         Raises:
-            CheckpointError: The artifact is missing or damaged, or was made for another target, action space or chunk
-                length.
+            CheckpointError: The artifact is missing or damaged, or was made for another target, action space,
+                normalisation or chunk length.
         """
         description = self.read(path)
-        made_for, what = self.made_for(description), f"the {self.noun} in {path}"
-        made_for.check_same(MadeFor.of(target), what, self.made, self.anew(path))
+        made, what, again = self.made_for(description), f"the {self.noun} in {path}", self.anew(path)
+        made.actions.check_same(target.actions, what, "the target", statistics=True)
+        what = f"{what} was {self.made}"
+        if made.chunk and made.chunk != target.chunk:
+            raise CheckpointError(f"{what} for chunks of {made.chunk} steps, not of {target.chunk}: {again}")
+        check_sources({TARGET: made.sha256}, {TARGET: target.origin["sha256"]}, what, again)
         return description
 
 

@@ -11,7 +11,6 @@ from kerv_cli.base import registry
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import check_settings
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.parallel import check_parallel, is_parallel
 from kerv_cli.methods.settings import MethodSettings
 
 if TYPE_CHECKING:
@@ -89,18 +88,7 @@ class Method:
         chunk_steps(self.chunk, target.chunk)
         for kind, part in self.parts.items():
             part.check_code(kind, bool(target.actions.code))
-        self._check_drafts()
-        check_parallel(self.parts, is_parallel(target))
-        self._check_skip()
-        self._check_batch(batch)
-
-    def _check_drafts(self) -> None:
-        """Check the proposer, the boundary and the prefill draft.
-
-        A boundary that chooses between retrieval and the drafter needs a proposer that has both. Such a proposer needs
-        such a boundary. A prefill draft must not need the target's hidden states, which exist only after the prefill.
-        """
-        proposer, draft = self.proposer, self.prefill_draft
+        proposer, draft, skip = self.proposer, self.prefill_draft, self.skip
         boundary = registry.BoundaryPart.find(self.settings["boundary"].kind)
         if proposer.has_boundary != boundary.chooses:
             raise UsageError(
@@ -112,19 +100,27 @@ class Method:
                 f"prefill_draft={draft.name}: it reads the target's states, which come after the prefill; use it as "
                 f"proposer={draft.name}"
             )
-
-    def _check_skip(self) -> None:
-        """Check that the prefill draft is a whole chunk, if the skip rule may execute it without verification."""
-        skip, draft = self.skip, self.prefill_draft
+        parallel = getattr(target, "parallel", False)
+        if skip.name == "parallel" and not parallel:
+            raise UsageError(
+                "skip=parallel: this target decodes token by token. Use policy=parallel, or train a parallel target "
+                "with kerv train target target.parallel=true"
+            )
+        if parallel and skip.name != "parallel":
+            raise UsageError("this target decodes all tokens at once and nothing else: use method=parallel")
+        for kind in ("prefill_draft", "proposer"):
+            if parallel and not self.parts[kind].absent:
+                name = self.parts[kind].name
+                raise UsageError(f"skip=parallel with {kind}={name}: nothing is drafted, leave it out")
         if skip.takes_draft and not draft.chains and not (skip.merges and draft.merged):
             raise UsageError(
                 f"skip={skip.name} with prefill_draft={draft.name}: it executes a draft from before the prefill"
             )
+        if batch > 1:
+            self._check_batch(batch)
 
     def _check_batch(self, batch: int) -> None:
-        """Check that the method can decode several episodes together, if `batch` is not 1."""
-        if batch == 1:
-            return
+        """Check that the method can decode several episodes together."""
         draft, skip = self.prefill_draft, self.skip
         threshold = registry.ThresholdPart.find(self.settings["threshold"].kind)
         is_used = draft.absent or skip.takes_draft

@@ -120,8 +120,8 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         for index in range(count):
             episode = dataset.load(index)
             steps = evenly(observed_steps(episode, sees), share)
-            shared = {"episodes": index, "perturbed": episode.perturbed}
-            columns = {name: torch.full((len(steps),), value) for name, value in shared.items()}
+            size = (len(steps),)
+            columns = {"episodes": torch.full(size, index), "perturbed": torch.full(size, episode.perturbed)}
             parts.append(self.decoded(target, episode, steps, dataset.manifest.observation, columns))
             progress(index + 1, count)
         return split(type(parts[0]).joined(parts), held_out)

@@ -64,15 +64,19 @@ class MotionRule(DistanceRule):
         code_of(context, "acceptance=motion")
         return cls(context.target.actions, settings.tolerance)
 
+    @property
+    def code(self) -> FastCode:
+        """The FAST code of the target's tokens."""
+        assert self.space.code is not None
+        return self.space.code
+
     @functools.cached_property
     def basis(self) -> np.ndarray:
         """(H · D, H · D) float64. Row i is the flattened motion whose coefficient i is 1, and all others are 0."""
         import numpy as np
 
-        code = self.space.code
-        assert code is not None
-        unit = np.eye(code.steps * code.dofs)
-        return code.motions(unit).reshape(unit.shape)
+        unit = np.eye(self.code.steps * self.code.dofs)
+        return self.code.motions(unit).reshape(unit.shape)
 
     def limits(self, r: int) -> tuple[int, ...]:
         """Return (0,), because FAST tokens have no distance to each other. The radius `r` is not used."""
@@ -85,22 +89,12 @@ class MotionRule(DistanceRule):
         """
         import numpy as np
 
-        code = self.space.code
-        assert code is not None
-        start = len(code.decode(before))
+        start = len(self.code.decode(before))
         gap = np.zeros(len(self.basis) - start)
         for sign, one in ((1, token), (-1, other)):
-            part = code.parts[one][: len(gap)]
+            part = self.code.parts[one][: len(gap)]
             gap[: len(part)] += sign * np.array(part, dtype=float)
         return float(np.abs(gap @ self.basis[start:]).max(initial=0.0))
-
-    def is_close(self, before: Sequence[int], token: int, target: int) -> bool:
-        """Return whether the draft `token` may stand for the target's token after the tokens `before`."""
-        code = self.space.code
-        assert code is not None
-        if target != code.end and (token == code.end or len(code.parts[token]) > len(code.parts[target])):
-            return False
-        return self.difference(before, token, target) <= self.tolerance
 
     def judge_after(self, tokens: Sequence[int], tree: TokenTree, target_tokens: Sequence[int], r: int) -> Accepted:
         """Return the longest path of accepted draft tokens. Of equally long paths the first wins. `r` is not used."""
@@ -110,7 +104,9 @@ class MotionRule(DistanceRule):
             before, target = paths.get(parent), target_tokens[parent + 1]
             if before is None or self.space.end in before:
                 continue
-            if token == target or self.is_close(before, token, target):
+            decides_more = len(self.code.parts[token]) > len(self.code.parts[target])
+            ends_early = target != self.code.end and (token == self.code.end or decides_more)
+            if token == target or (not ends_early and self.difference(before, token, target) <= self.tolerance):
                 paths[node] = [*before, token]
                 best = node if len(paths[node]) > len(paths[best]) else best
         return Accepted(tuple(tree.path_to(best)), nearest_child(tree, best, target_tokens))

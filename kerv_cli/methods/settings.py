@@ -12,10 +12,6 @@ from kerv_cli.base.settings import RunSettings, part
 MODEL, EXPERT = "model", "expert"
 
 
-def _unnamed() -> dict[str, str | None]:
-    return dict.fromkeys(parts("artifact"))
-
-
 @dataclass
 class PolicySettings:
     """The policy that chooses the actions.
@@ -25,7 +21,9 @@ class PolicySettings:
 
     kind: str = choice(MODEL, MODEL, EXPERT, help="expert: the environment's scripted policy, without decoding")
     target: str = setting("mt10-vision", "name of the policy's weights, or a path")
-    artifacts: dict[str, str | None] = setting(_unnamed, "artifacts.KIND=NAME; null: the one beside the target")
+    artifacts: dict[str, str | None] = setting(
+        lambda: dict.fromkeys(parts("artifact")), "artifacts.KIND=NAME; null: the one beside the target"
+    )
 
 
 # help text of a setting that several commands have

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import number
 from kerv_cli.base.registry import PREFILL, ArtifactPart, ProposerPart, SkipPart
-from kerv_cli.methods.streak import StreakSkip, StreakSkipSettings
+from kerv_cli.methods.unverified import StreakSkip, StreakSkipSettings
 
 if TYPE_CHECKING:
     from kerv_cli.engine.parts import Skip

@@ -36,9 +36,9 @@ from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.drafters import Decodes, DrafterDescription, Metrics, TrainableDrafter
 from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.public import PublicDrafter, PublicShape, load_public
+from kerv_cli.methods.eagle.public import DraftNetwork, PublicDrafter, PublicShape
 from kerv_cli.methods.spec_vla import RelaxedRule
-from kerv_cli.targets.attention import Cache
+from kerv_cli.targets.compact.compilable import load_compiled
 from kerv_cli.targets.compact.program import Program
 from kerv_cli.targets.compact.trunk import LayerStack
 from kerv_cli.targets.observations import observations_of, prompts_of
@@ -48,7 +48,7 @@ VALIDATED = 60
 """Maximum number of held-out observations that a validation decodes."""
 
 
-class EagleNetwork(LayerStack):
+class EagleNetwork(DraftNetwork, LayerStack):
     """The drafter's network: decoder layers of the target's shape. It uses the target's embeddings and head."""
 
     inputs = 2
@@ -61,33 +61,6 @@ class EagleNetwork(LayerStack):
     def enter(self, *inputs: Tensor) -> Tensor:
         """Map the embeddings of the next tokens and the hidden states, each (B, T, E), to the first layer's input."""
         return self.fuse(torch.cat(inputs, -1))
-
-    def draft_position(self, index: int) -> int:
-        """Return the rotary position at which drafting begins.
-
-        Args:
-            index: Position of the first draft step in the sequence, counted from the prompt's beginning.
-        """
-        return index
-
-    def forward(
-        self,
-        following: Tensor,
-        hidden: Tensor,
-        positions: Tensor,
-        cache: Cache | None = None,
-        seen: np.ndarray | Tensor | None = None,
-    ) -> Tensor:
-        """Return the predicted hidden states at the next positions, (B, T, E).
-
-        Args:
-            following: (B, T, E) embedding of the token after each position.
-            hidden: (B, T, E) hidden state at each position.
-            positions: (T,) rotary positions.
-            cache: Keys and values of earlier positions. None: there are no earlier positions.
-            seen: (T, M) bool, which of the last M keys each query sees. None: all keys up to its own position.
-        """
-        return self.run((following, hidden), positions, cache, seen)
 
     def joined(self, target: Any, tree: bool) -> Any:
         """Return a compiled program that drafts level after level, with the target's embeddings and head.
@@ -175,7 +148,7 @@ class DrafterProposer(Proposer):
         base = self.cache.length
         if self.compiled is not None:
             return torch.from_numpy(self.compiled.repeat(depth, self.hidden, cache=self.cache)[:, 0]).long()
-        first = self.drafter.draft_position(base)
+        first = base - self.drafter.skipped
         positions = torch.arange(first, first + depth, device=self.hidden.device).split(1)
         hidden = self.hidden[None, None]
         drafted = [self.target.head(hidden[0]).argmax(-1)]
@@ -194,7 +167,7 @@ class DrafterProposer(Proposer):
         parent.
         """
         target, top_k, device, base = self.target, self.top_k, self.hidden.device, self.cache.length
-        first = self.drafter.draft_position(base)
+        first = base - self.drafter.skipped
         if self.compiled is not None:
             root = self.hidden[None, None]
             grown = self.compiled.grow(depth, top_k, self.nodes, root, position=first, cache=self.cache)
@@ -279,11 +252,12 @@ class EagleDrafter(TrainableDrafter):
     def load(self, path: Path, artifacts: Artifacts) -> EagleNetwork | PublicDrafter:
         """Load the network for inference, in our own layout or the published one."""
         description: Any = self.checked(path, artifacts.description)
+        target = artifacts.target
         if description.public is not None:
-            return load_public(path, description.public, artifacts.target)
+            return load_compiled(PublicDrafter(description.public), path, self.kind, target.device, target.dtype)
         network: EagleNetwork = super().load(path, artifacts)
-        if isinstance(artifacts.target, JoinsDrafters):
-            artifacts.target.enlarge(network)
+        if isinstance(target, JoinsDrafters):
+            target.enlarge(network)
         return network
 
     @classmethod

@@ -8,8 +8,10 @@ Shapes: B sequences, T new tokens, S cached tokens, P prompt tokens, E width of 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,9 +22,8 @@ from kerv_cli.base.files import read_json
 from kerv_cli.base.manifests import read
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.targets.attention import Cache, attention_mask
-from kerv_cli.targets.checkpoint import WEIGHTS, load_tensors
 from kerv_cli.targets.openvla.config import CONFIG, Language
-from kerv_cli.targets.openvla.loading import SINGLE, Sizes, check_layout, open_shards, sizes_of
+from kerv_cli.targets.openvla.loading import SINGLE, check_layout, open_shards, sizes_of
 from kerv_cli.targets.openvla.trunk import LlamaLayer, run_layers
 
 EMBEDDING = "embed_tokens.weight"
@@ -66,12 +67,45 @@ class DraftCache(Cache):
     prompt = 0
 
 
-class PublicDrafter(nn.Module):
+class DraftNetwork(nn.Module):
+    """Base of the networks of EAGLE-style drafters.
+
+    Attributes:
+        skipped: Number of prompt tokens that get no position number. Rotary positions of drafted tokens do not count
+            them.
+    """
+
+    skipped = 0
+    run: Callable[..., Tensor]
+
+    def forward(
+        self,
+        following: Tensor,
+        hidden: Tensor,
+        positions: Tensor,
+        cache: Cache | None = None,
+        seen: np.ndarray | Tensor | None = None,
+    ) -> Tensor:
+        """Return the predicted hidden states at the next positions, (B, T, E).
+
+        Args:
+            following: (B, T, E) embedding of the token after each position.
+            hidden: (B, T, E) hidden state at each position.
+            positions: (T,) rotary positions.
+            cache: Keys and values of earlier positions. If it is empty, `hidden` must have the states of the whole
+                prompt. None: there are no earlier positions.
+            seen: (T, M) bool, which of the last M keys each query sees. None: all keys up to its own position.
+        """
+        return self.run((following, hidden), positions, cache, seen)
+
+
+class PublicDrafter(DraftNetwork):
     """The network of a published drafter."""
 
     def __init__(self, shape: PublicShape) -> None:
         super().__init__()
         self.shape, language = shape, shape.language
+        self.skipped = shape.skipped if shape.convention.positions == "text" else 0
         self.fc = nn.Linear(2 * language.hidden_size, language.hidden_size, bias=shape.bias)
         self.layers = nn.ModuleList(LlamaLayer(language, normed=i > 0) for i in range(language.num_hidden_layers))
 
@@ -86,35 +120,11 @@ class PublicDrafter(nn.Module):
         weight, sizes = self.fc.weight, self.shape.language.cache_sizes(batch, capacity)
         return DraftCache(*sizes, weight, weight.is_cuda if fixed is None else fixed)
 
-    def draft_position(self, index: int) -> int:
-        """Return the rotary position at which drafting begins.
-
-        Args:
-            index: Position of the first draft step in the sequence, counted from the prompt's beginning.
-        """
-        return index - self.shape.skipped * (self.shape.convention.positions == "text")
-
-    def forward(
-        self,
-        following: Tensor,
-        hidden: Tensor,
-        positions: Tensor,
-        cache: DraftCache | None = None,
-        seen: np.ndarray | Tensor | None = None,
-    ) -> Tensor:
-        """Return the predicted hidden states at the next positions, (B, T, E).
-
-        Args:
-            following: (B, T, E) embedding of the token after each position.
-            hidden: (B, T, E) hidden state at each position.
-            positions: (T,) rotary positions.
-            cache: Keys and values of earlier positions. If it is empty, `hidden` must have the states of the whole
-                prompt. None: there are no earlier positions.
-            seen: (T, M) bool, which of the last M keys each query sees. None: all keys up to its own position.
-        """
+    def run(self, inputs: Sequence[Tensor], positions: Tensor, cache: Any, seen: np.ndarray | Tensor | None) -> Tensor:
+        """Compute what `forward` returns. `inputs` are its first two arguments."""
         if cache is not None and not cache.length:
-            cache.prompt = hidden.shape[1]
-        x = self.fc(torch.cat([following, hidden], -1))
+            cache.prompt = inputs[0].shape[1]
+        x = self.fc(torch.cat([*inputs], -1))
         mask = self.prompt_mask(x, cache, seen) if self.shape.convention.mask == "prompt" else None
         return run_layers(self.layers, self.shape.language, x, positions, cache, seen, mask)
 
@@ -138,12 +148,6 @@ class PublicDrafter(nn.Module):
             mask = x.new_zeros(x.shape[1], cache.length + x.shape[1])
         mask[:, max(1, prompt - 1) :] = -torch.inf
         return mask
-
-
-def layout_of(shape: PublicShape) -> dict[str, Sizes]:
-    """Return the size of each tensor that a published drafter of this shape must contain, by the tensor's name."""
-    with torch.device("meta"):
-        return sizes_of(PublicDrafter(shape))
 
 
 def read_public(folder: Path, target: ReadableTarget, convention: Convention) -> tuple[PublicShape, dict[str, Tensor]]:
@@ -172,19 +176,7 @@ def read_public(folder: Path, target: ReadableTarget, convention: Convention) ->
     skipped = target.segments["vision"] if "vision" in target.segments else slice(0, 0)
     shape = PublicShape(language, "fc.bias" in shards.shapes, convention, skipped.stop - skipped.start)
     layout = {name: sizes for name, sizes in shards.shapes.items() if name != EMBEDDING}
-    check_layout(layout, layout_of(shape), folder)
+    with torch.device("meta"):
+        wanted = sizes_of(PublicDrafter(shape))
+    check_layout(layout, wanted, folder)
     return shape, {name: tensor for name, tensor in shards.items() if name != EMBEDDING}
-
-
-def load_public(folder: Path, shape: PublicShape, target: ReadableTarget) -> PublicDrafter:
-    """Load an imported drafter with frozen weights, on the target's device and in the target's number format.
-
-    Raises:
-        CheckpointError: The weights are damaged or have other shapes.
-    """
-    tensors = load_tensors(folder / WEIGHTS, "drafter")
-    layout = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-    check_layout(layout, layout_of(shape), folder)
-    drafter = PublicDrafter(shape)
-    drafter.load_state_dict(tensors)
-    return drafter.to(device=target.device, dtype=target.dtype).eval().requires_grad_(False)

@@ -314,33 +314,27 @@ class Random(Boundary):
     on the boundary's seed, the task's full name and the episode's seed.
     """
 
-    def __init__(self, p: float, seed: int = 0) -> None:
-        self.p, self.seed = p, seed
+    def __init__(self, settings: RandomBoundarySettings, context: Any = None) -> None:
+        super().__init__(settings)
         self.reset("", 0)
-
-    @classmethod
-    def build(cls, settings: RandomBoundarySettings, context: Context) -> Random:
-        """Build the part that the setting `boundary=random` chooses."""
-        return cls(settings.p, settings.seed)
 
     def reset(self, task: str, seed: int) -> None:
         """Begin an episode: seed the random numbers."""
         import numpy as np
 
-        self.random = np.random.default_rng([self.seed, zlib.crc32(task.encode()), seed])
+        self.random = np.random.default_rng([self.settings.seed, zlib.crc32(task.encode()), seed])
 
     def choose(self, path: np.ndarray) -> Choice:
         """Choose retrieval with probability p, else the drafter. The path is not used."""
-        return Choice("retrieval" if self.random.random() < self.p else "drafter")
+        return Choice("retrieval" if self.random.random() < self.settings.p else "drafter")
 
 
-class Always(Random):
+class Always(Boundary):
     """Makes the same choice for every chunk: boundary=always_retrieval or boundary=always_drafter."""
 
-    @classmethod
-    def build(cls, settings: Any, context: Context) -> Always:
-        """Build the boundary that `settings.kind` names."""
-        return cls(float(settings.kind == "always_retrieval"))
+    def choose(self, path: np.ndarray) -> Choice:
+        """Return the choice that the boundary's name tells. The path is not used."""
+        return Choice(self.settings.kind.removeprefix("always_"))
 
 
 registry.BoundaryPart("always_retrieval", chooses=True)(Always)
@@ -369,7 +363,6 @@ class FusedBoundarySettings:
     chooses=True,
     idle=lambda settings: {} if settings.f_star is None else {"quantile": "boundary.f_star names the limit"},
 )
-@dataclass(frozen=True)
 class Fused(Boundary):
     """Chooses retrieval if F ≥ F*. F is the weighted sum of the radius of curvature and the length of the hand's path.
 
@@ -377,31 +370,21 @@ class Fused(Boundary):
 
     Attributes:
         ranges: Ranges by which radius and length are scaled to [0, 1], before they are added.
-        alpha: Weight of the radius. The length has the weight 1 − alpha.
-        window: Number of newest positions to look at.
         f_star: The limit F*.
     """
 
-    ranges: BoundaryRanges
-    alpha: float
-    window: int
-    f_star: float
-
-    @classmethod
-    def build(cls, settings: FusedBoundarySettings, context: Context) -> Fused:
-        """Build the part that the setting `boundary=fused` chooses."""
-        ranges = context.calibration.ranges(settings.window)
-        f_star = settings.f_star
-        if f_star is None:
-            f_star = ranges.limit(settings.quantile, settings.alpha)
-        return cls(ranges, settings.alpha, settings.window, f_star)
+    def __init__(self, settings: FusedBoundarySettings, context: Context) -> None:
+        super().__init__(settings)
+        self.ranges: BoundaryRanges = context.calibration.ranges(settings.window)
+        limit = settings.f_star
+        self.f_star = self.ranges.limit(settings.quantile, settings.alpha) if limit is None else limit
 
     def choose(self, path: np.ndarray) -> Choice:
         """Choose retrieval or the drafter by the newest `window` positions of the hand's path (m, 3), in metres."""
-        points = path[-self.window :]
+        points = path[-self.settings.window :]
         if len(points) < LEAST:
             return Choice("drafter")
-        metric = self.ranges.of_path(points, self.alpha)
+        metric = self.ranges.of_path(points, self.settings.alpha)
         return Choice("retrieval" if metric >= self.f_star else "drafter", metric)
 
 
@@ -420,13 +403,12 @@ class SimilaritySkipSettings:
     up: float = number(0.0, 0, 1e9)
     down: float = number(0.0, 0, 1e9)
 
+    def needs(self) -> tuple[str, ...]:
+        """Return the kinds of artifacts needed: the datastore, and the calibration if `s_min` is None."""
+        return ("datastore", "calibration") if self.s_min is None else ("datastore",)
 
-def needs_of_similarity(settings: SimilaritySkipSettings) -> tuple[str, ...]:
-    """Return the kinds of artifacts needed: the datastore, and the calibration if `s_min` is None."""
-    return ("datastore", "calibration") if settings.s_min is None else ("datastore",)
 
-
-@registry.SkipPart("similarity", SimilaritySkipSettings, needs=needs_of_similarity, colour=0xF0E442)
+@registry.SkipPart("similarity", SimilaritySkipSettings, needs=SimilaritySkipSettings.needs, colour=0xF0E442)
 class VerifySkip(Skip):
     """Executes the most similar stored chunk without verification if its similarity is at least s_min.
 

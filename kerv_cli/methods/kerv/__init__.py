@@ -1,4 +1,7 @@
-"""KERV (docs/methods.md §3): after a rejection, predict actions from the motion; adapt the threshold to the motion."""
+"""KERV (docs/methods.md §3): after a rejection, predict actions from the motion; adapt the threshold to the motion.
+
+The calibration, whose numbers KERV and HeiSD read, is registered here, too.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, choice, number
-from kerv_cli.base.registry import PREFILL, NoSettings, ProposerPart, RectifierPart, ThresholdPart
+from kerv_cli.base.registry import PREFILL, ArtifactPart, NoSettings, ProposerPart, RectifierPart, ThresholdPart
 from kerv_cli.engine.decisions import Rectified
 from kerv_cli.engine.parts import Rectifier, Threshold
 
@@ -17,6 +20,15 @@ if TYPE_CHECKING:
     from kerv_cli.engine.record import Measure
     from kerv_cli.methods.context import Context
     from kerv_cli.methods.kerv.prediction import Predictor
+
+
+# the calibration has a section for a drafter and one for a datastore
+@ArtifactPart("calibration", needs=("drafter", "datastore"), by_task=True, needs_task=True)
+def artifact() -> type:
+    """Import and return the class that makes and loads calibrations."""
+    from kerv_cli.methods.calibration import CalibrationArtifact
+
+    return CalibrationArtifact
 
 
 # --- predictors, and proposers that draft with them (§3.1, §6)
@@ -51,10 +63,17 @@ class PredictorPart(ProposerPart):
 
 
 def predictor(settings: NoSettings, context: Context) -> Predictor:
-    """Build kerv's own predictor with the name `settings.kind`."""
-    from kerv_cli.methods.kerv.prediction import predictor_of
+    """Build kerv's own predictor `settings.kind`. Its horizon is long enough for all control steps of a chunk.
 
-    return predictor_of(settings.kind, context)
+    The noise of a Kalman filter comes from the calibration.
+    """
+    from kerv_cli.methods.kerv.prediction import FILTERS, PREDICTORS
+
+    kind, held, horizon = PREDICTORS[settings.kind], context.target.actions.is_strict, context.target.chunk
+    if kind.name not in FILTERS:
+        return kind(held, minimum=kind.least, horizon=horizon)
+    fitted = context.calibration
+    return kind(held, fitted.noise[kind.name], window=fitted.window, horizon=horizon)
 
 
 _noise = ("calibration",)  # Kalman filters need the noise that `kerv calibrate` fitted
@@ -112,13 +131,12 @@ class CompensateSettings:
                 "rectifier.predictor=draft goes on after the target's token: leave rectifier.use_target_token=true"
             )
 
+    def needs(self) -> tuple[str, ...]:
+        """Return the kinds of artifacts that the predictor needs."""
+        return () if self.predictor == DRAFT else find_predictor(self.predictor).needed(self)
 
-def needs_of_compensation(settings: CompensateSettings) -> tuple[str, ...]:
-    """Return the kinds of artifacts that the predictor needs."""
-    return () if settings.predictor == DRAFT else find_predictor(settings.predictor).needed(settings)
 
-
-@RectifierPart("compensate", CompensateSettings, needs=needs_of_compensation)
+@RectifierPart("compensate", CompensateSettings, needs=CompensateSettings.needs)
 class Compensation(Rectifier):
     """KERV: after a rejected draft token, keeps the tokens before and predicts the rest of the control step.
 
@@ -223,6 +241,10 @@ class KinematicThresholdSettings(RadiusRange):
 
         return Measure(self.over == ACCEPTED, self.total)
 
+    def needs(self) -> tuple[str, ...]:
+        """Return the kinds of artifacts needed: the calibration, if `k_s` is None."""
+        return ("calibration",) if self.k_s is None else ()
+
 
 @dataclass
 class ScheduleThresholdSettings(RadiusRange):
@@ -238,17 +260,18 @@ class ScheduleThresholdSettings(RadiusRange):
     tau: float = number(20.0, above=0, most=1e9)  # time constant τ, in decodes
 
 
-def needs_of_variability(settings: KinematicThresholdSettings) -> tuple[str, ...]:
-    """Return the kinds of artifacts needed: the calibration, if `k_s` is None."""
-    return ("calibration",) if settings.k_s is None else ()
-
-
-@ThresholdPart("kinematic", KinematicThresholdSettings, needs=needs_of_variability)
-class Kinematic(Threshold):
+class Variable(Threshold):
     """KERV: the acceptance radius r follows the variability K, the mean distance of draft tokens to target tokens.
 
-    r = r_min + (r_max − r_min) · exp(−(K / K_S)^φ). K was measured in the last decode that compared drafts. K_S is the
-    task's reference level. r_min, r_max and φ are settings. An episode begins as if K were K_S.
+    After each decode that compared drafts, r becomes, with f(x) = r_min + (r_max − r_min) · exp(−(x / K_S)^φ) and the
+    change ΔK since the last such decode:
+
+    - `kinematic` (ours): f(K).
+    - `change`: r ± (r_max − f(|ΔK|)). r shrinks if K has risen, and grows if K has fallen.
+    - `offset` (KERV's README): f(|ΔK|). So r is large while K is steady.
+    - `quoted` (arXiv 2603.01581): r + f(|ΔK|) − r_min. r never shrinks: it rises from r_min to r_max and stays.
+
+    r is limited to r_min … r_max. An episode begins as if K had been K_S. K_S is the task's reference level.
 
     Attributes:
         r: The radius of the next decode, in bins, not rounded.
@@ -275,14 +298,11 @@ class Kinematic(Threshold):
 
     def reset(self) -> None:
         """Begin an episode, as if the last decode's variability K was the reference level K_S."""
-        self.r, self.last = self.falling(self.k_s), self.k_s
+        self.last = self.k_s
+        self.r = float(self.settings.r_min) if self.settings.kind == "quoted" else self.falling(self.k_s)
 
     def falling(self, x: float) -> float:
-        """Return a radius that falls as x grows: r_min + (r_max − r_min) · exp(−(x / K_S)^φ).
-
-        Args:
-            x: A variability or its change, in normalised action units.
-        """
+        """Return f(x), a radius that falls as x, a variability or its change, grows."""
         s = self.settings
         return falling(s.r_min, s.r_max, x / self.k_s, s.phi)
 
@@ -296,57 +316,20 @@ class Kinematic(Threshold):
         Args:
             variability: K of the last decode. None: no draft was compared, and r stays.
         """
-        if variability is not None:
-            r = self.next(variability)
-            self.r, self.last = min(self.settings.r_max, max(self.settings.r_min, r)), variability
-
-    def next(self, variability: float) -> float:
-        """Return r after a decode with this variability K. `update` limits it to r_min … r_max."""
-        return self.falling(variability)
-
-
-@ThresholdPart("change", KinematicThresholdSettings, needs=needs_of_variability)
-class Change(Kinematic):
-    """KERV's rule with a signed change: the acceptance radius r shrinks if the variability K grows, else it grows.
-
-    r ← clamp(r − (r_max − r_min) · sign(Δ) · (1 − exp(−|Δ / K_S|^φ)), r_min, r_max). Δ is the change of K between the
-    last two decodes in which drafts were compared. An episode begins as if the last K were K_S.
-    """
-
-    def next(self, variability: float) -> float:
-        """Return r, lowered if K has risen and raised if K has fallen."""
-        change = variability - self.last
-        return self.r - math.copysign(self.settings.r_max - self.falling(abs(change)), change)
+        if variability is None:
+            return
+        s, change = self.settings, variability - self.last
+        if s.kind == "change":
+            r = self.r - math.copysign(s.r_max - self.falling(abs(change)), change)
+        elif s.kind == "quoted":
+            r = self.r + self.falling(abs(change)) - s.r_min
+        else:
+            r = self.falling(variability if s.kind == "kinematic" else abs(change))
+        self.r, self.last = min(s.r_max, max(s.r_min, r)), variability
 
 
-@ThresholdPart("offset", KinematicThresholdSettings, needs=needs_of_variability)
-class Offset(Kinematic):
-    """KERV's rule as its README says: r = r_min + (r_max − r_min) · exp(−(|ΔK| / K_S)^φ).
-
-    ΔK is the change of the variability K between the last two decodes in which drafts were compared. So r is large
-    while K is steady, and small when K changes. The first change of K in an episode is measured from K_S.
-    An episode begins with the radius for |ΔK| = K_S.
-    """
-
-    def next(self, variability: float) -> float:
-        """Return the radius for the change of K since the last decode."""
-        return self.falling(abs(variability - self.last))
-
-
-@ThresholdPart("quoted", KinematicThresholdSettings, needs=needs_of_variability)
-class Quoted(Kinematic):
-    """KERV's formula as printed (arXiv 2603.01581): r ← min(r + (r_max − r_min) · exp(−(|ΔK| / K_S)^φ), r_max).
-
-    ΔK is the change of the variability K. The formula never makes r smaller, so r rises from r_min to r_max and stays.
-    """
-
-    def reset(self) -> None:
-        """Begin an episode with the smallest radius r_min. The first change of K is measured from K_S."""
-        self.r, self.last = float(self.settings.r_min), self.k_s
-
-    def next(self, variability: float) -> float:
-        """Return the raised r. A small change of K raises it more than a large one."""
-        return self.r + self.falling(abs(variability - self.last)) - self.settings.r_min
+for _kind in ("kinematic", "change", "offset", "quoted"):
+    ThresholdPart(_kind, KinematicThresholdSettings, needs=KinematicThresholdSettings.needs)(Variable)
 
 
 @ThresholdPart("schedule", ScheduleThresholdSettings)
@@ -378,6 +361,47 @@ class Schedule(Threshold):
     def update(self, variability: float | None) -> None:
         """Count a decode. Its variability is not used."""
         self.decodes += 1
+
+
+@dataclass
+class ContactThresholdSettings(RadiusRange):
+    """The radius grows with the distance from hand to object, as the policy itself estimates it."""
+
+    kind: str = "contact"
+    r_min: int = number(3, 0, MOST_BINS)  # radius at the object, bins
+    r_max: int = number(15, 0, MOST_BINS)  # radius from the distance `near` on, bins
+    near: float = number(0.1, above=0, most=100)  # metres
+
+
+@ThresholdPart("contact", ContactThresholdSettings)
+class Contact(Threshold):
+    """The acceptance radius r grows linearly from r_min at the object to r_max at the distance `near` and beyond.
+
+    The policy itself estimates the distance from hand to object, whenever it encodes an observation. The last estimate
+    is used, which comes from an earlier decode. The first decode of an episode uses r_min.
+    """
+
+    def __init__(self, settings: ContactThresholdSettings, context: Context) -> None:
+        """Read the settings.
+
+        Raises:
+            UsageError: The policy estimates no positions. Or the largest radius is larger than the largest distance
+                between two tokens.
+        """
+        context.check_radius("r_max", settings.r_max)
+        if not hasattr(context.target, "hand_and_object"):
+            raise UsageError("threshold=contact: this policy estimates no position of an object. Use another threshold")
+        self.settings, self.target = settings, context.target
+
+    def reset(self) -> None:
+        """Begin an episode: forget the last observation."""
+        self.target.hand_and_object = None
+
+    def radius(self) -> int:
+        """Return the acceptance radius r, rounded to whole bins."""
+        seen, s = self.target.hand_and_object, self.settings
+        distance = float((seen[0] - seen[1]).norm()) if seen is not None else 0.0
+        return nearest(s.r_min + (s.r_max - s.r_min) * min(1.0, distance / s.near))
 
 
 def falling(low: float, high: float, x: float, phi: float) -> float:

@@ -22,7 +22,6 @@ from kerv_cli.engine.proposer import ChainProposer
 
 if TYPE_CHECKING:
     from kerv_cli.engine.chunk import Chunk
-    from kerv_cli.methods.context import Context
     from kerv_cli.methods.kerv import CompensateSettings
 
 MINIMUM = 4  # minimum number of past actions; longer windows were not measurably better on the demonstrations
@@ -172,21 +171,9 @@ class Predictor:
         """
         if len(history) < self.minimum:
             return None
-        return self.predict_many(np.asarray(history, dtype=np.float64)[None], steps)[0]
-
-    def predict_many(self, histories: np.ndarray, steps: int) -> np.ndarray:
-        """Predict the next `steps` actions after each of B histories.
-
-        Args:
-            histories: (B, m, D) past actions, oldest first, with m ≥ `minimum`.
-            steps: Number of actions to predict.
-
-        Returns:
-            (B, steps, D) in [-1, 1].
-        """
-        past = histories[:, -self.window :]
-        table = self.tables[past.shape[1]][:, :steps]
-        predicted: np.ndarray = np.einsum("dhm,bmd->bhd", table, past)
+        past = np.asarray(history, dtype=np.float64)[-self.window :]
+        table = self.tables[len(past)][:, :steps]
+        predicted: np.ndarray = np.einsum("dhm,bmd->bhd", table, past[None])[0]
         return np.clip(predicted, -1.0, 1.0)
 
 
@@ -279,18 +266,6 @@ class Ridge(Predictor):
 
 FILTERS = ("kalman", "damped")
 PREDICTORS = {kind.name: kind for kind in (Hold, Linear, Kalman, Damped, Walk)}
-
-
-def predictor_of(name: str, context: Context) -> Predictor:
-    """Return the predictor with this name. Its horizon is long enough for all control steps of a chunk.
-
-    The noise of a Kalman filter comes from the calibration.
-    """
-    kind, held, horizon = PREDICTORS[name], context.target.actions.is_strict, context.target.chunk
-    if kind.name not in FILTERS:
-        return kind(held, minimum=kind.least, horizon=horizon)
-    fitted = context.calibration
-    return kind(held, fitted.noise[kind.name], window=fitted.window, horizon=horizon)
 
 
 class PredictionProposer(ChainProposer):

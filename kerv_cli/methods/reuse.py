@@ -1,0 +1,97 @@
+"""Proposers that reuse known tokens: the target's last predictions (Jacobi), or the last chunk (prompt lookup).
+
+Jacobi decoding is that of PD-VLA, prompt lookup decoding that of Saxena (2023); both are in docs/methods.md §6.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from kerv_cli.base.limits import MOST_TOKENS, number
+from kerv_cli.base.registry import PREFILL, STATES, ProposerPart
+from kerv_cli.engine.proposer import ChainProposer
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from kerv_cli.engine.chunk import Chunk
+
+
+@dataclass
+class JacobiProposerSettings:
+    """Jacobi decoding: guess all tokens, and take the target's argmax at all positions as the next guess (§6)."""
+
+    kind: str = "jacobi"
+    depth: int = number(0, 0, MOST_TOKENS)  # number of tokens guessed at once; 0: all remaining tokens
+
+
+# without `chains`, because its first guess is made only after the prefill
+@ProposerPart("jacobi", JacobiProposerSettings, colour=0x8A7FD4, when=STATES, any_code=True)
+class JacobiProposer(ChainProposer):
+    """Guesses the remaining tokens of a chunk. After each forward, the target's tokens become the next guess.
+
+    With strict acceptance this ends with the tokens of autoregressive decoding. If a prefill draft was rejected, the
+    first guess begins with the target's tokens after the rejection. All other tokens of the first guess stand for
+    normalised actions of 0, or end the chunk if an end token can.
+
+    Attributes:
+        guess: The current guess of the remaining tokens.
+    """
+
+    name = "jacobi"
+    guess: list[int]
+
+    def begin(self, chunk: Chunk) -> None:
+        """Make the first guess, after the prefill."""
+        tokens = chunk.rejection.target[: chunk.remaining]
+        filler = chunk.space.tokens // 2 if chunk.space.end is None else chunk.space.end
+        self.guess = [*tokens, *[filler] * (chunk.remaining - len(tokens))]
+
+    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        """Return the current guess as one chain of at most `depth` tokens."""
+        return [self.guess[: min(depth, self.settings.depth or depth)]]
+
+    def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
+        """Make the next guess: this round's target tokens after the committed tokens, then the rest of the old guess.
+
+        Args:
+            chunk: The chunk that is decoded.
+            first: Index in the chunk of the token just before this round's tokens.
+            hidden: Not used.
+            target_tokens: The target's prediction after token `first`, then after each token of the guess, also
+                after rejected tokens.
+        """
+        accepted = len(chunk.tokens) - first - 2
+        self.guess = [*target_tokens[accepted + 1 :], *self.guess[len(target_tokens) - 1 :]]
+
+
+@dataclass
+class LookupProposerSettings:
+    """Search the last chunk for the newest committed tokens, and draft the tokens that followed there."""
+
+    kind: str = "lookup"
+    longest: int = number(3, 1, MOST_TOKENS)  # number of newest tokens that are searched for; if not found, fewer
+
+
+@ProposerPart("lookup", LookupProposerSettings, colour=0xB5651D, when=PREFILL, chains=True, any_code=True)
+class LookupProposer(ChainProposer):
+    """Searches the last chunk for the newest committed tokens, and drafts the tokens that followed there.
+
+    The newest `longest` tokens are searched for, then fewer of them. If they occur several times, the occurrence
+    nearest to the current index in the chunk wins. If not even the newest token occurs, or before the prefill, the
+    draft is the last chunk's tokens from the current index on.
+    """
+
+    name = "lookup"
+
+    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        """Return one chain of at most `depth` tokens. The chain is empty in an episode's first chunk."""
+        last, tokens = chunk.situation.last, chunk.tokens
+        for size in range(min(self.settings.longest, len(tokens)), 0, -1):
+            places = [place for place in range(size, len(last)) if last[place - size : place] == tokens[-size:]]
+            if places:
+                nearest = min(places, key=lambda place: abs(place - len(tokens)))
+                return [last[nearest:][:depth]]
+        return [last[len(tokens) :][:depth]]

@@ -1,0 +1,219 @@
+"""Skip rules that execute tokens without verification: the parallel pass, drafts, streaks, SP-VLA's regression.
+
+parallel    all tokens of a chunk in one forward of the target, as in OpenVLA-OFT (docs/methods.md §6)
+streak      drafts, as long as verified drafts agree with the target (§4.5, ours)
+always      every draft (§6)
+speed       SP-VLA: a regression predicts the chunk while the hand is fast, else the target decodes it (§6.1)
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.limits import number
+from kerv_cli.base.registry import NoSettings, SkipPart
+from kerv_cli.engine.decisions import SkipDecision
+from kerv_cli.engine.parts import Skip
+
+if TYPE_CHECKING:
+    from kerv_cli.engine.chunk import Chunk
+    from kerv_cli.engine.decoder import Decoder
+    from kerv_cli.engine.proposer import ChainProposer
+    from kerv_cli.engine.protocol import ParallelTarget
+    from kerv_cli.methods.context import Context
+
+TRUSTED, STREAK = "trusted", "streak"
+"""Values of `DecodeRecord.reason`. TRUSTED: the draft was executed without verification. STREAK: the target verified or
+decoded the chunk, because no further decode without verification was allowed, or because the draft was incomplete."""
+
+
+@SkipPart("parallel", colour=0x17BECF, verifies=False, batchable=True)
+class ParallelPass(Skip):
+    """Decodes all tokens of a chunk in one bidirectional forward of a parallel target.
+
+    Each token is chosen without knowing the others, and no token is verified.
+    """
+
+    phase = "prefill"
+
+    def __init__(self, target: ParallelTarget) -> None:
+        self.target = target
+
+    @classmethod
+    def build(cls, settings: NoSettings, context: Context) -> ParallelPass:
+        """Build the part that the setting `skip=parallel` chooses."""
+        return cls(context.target)
+
+    def take(self, chunk: Chunk) -> SkipDecision:
+        """Decode all tokens of the chunk in one forward of the target."""
+        from kerv_cli.engine.record import PARALLEL
+
+        hidden = self.target.parallel_pass(chunk.target.prompt, chunk.target.cache)
+        return SkipDecision(self.target.head(hidden[0, : chunk.size]).argmax(-1).tolist(), PARALLEL)
+
+
+def native_decoder(target: Any) -> Decoder:
+    """Return a decoder without drafts. A parallel target decodes all tokens in one forward, others token by token."""
+    from kerv_cli.engine.decoder import Decoder, Parts
+
+    return Decoder(target, Parts(skip=ParallelPass(target)) if getattr(target, "parallel", False) else None)
+
+
+@dataclass
+class StreakSkipSettings:
+    """Execute 1, then 2, 4, … drafts without verification, as long as each verified chunk agrees with its draft (§4.5).
+
+    The executed draft is the prefill draft. If the prefill draft merges the drafts of several proposers, only the draft
+    of the first proposer is executed and compared.
+    """
+
+    kind: str = "streak"
+    most: int = number(8, 1)  # maximum number of decodes in a row without verification
+    opening: int = number(0, 0)  # number of decodes without verification when an episode begins
+    # largest mean absolute difference of a draft that agrees, normalised action units; 0: it must be accepted whole
+    tolerance: float = number(0.05, 0)
+
+
+@SkipPart("streak", StreakSkipSettings, colour=0xE8C547, takes_draft=True, merges=True)
+class StreakSkip(Skip):
+    """Executes drafts without verification, as long as verified drafts agree with the target.
+
+    After the first verified chunk that agrees with its draft, 1 decode is not verified. Each further agreement doubles
+    this number, up to `most`. A chunk that does not agree resets it to 0. An episode begins with `opening` decodes
+    without verification.
+
+    Attributes:
+        source: The proposer of the drafts.
+        allowed: Number of unverified decodes that the last verification allowed.
+        left: How many of the allowed decodes are still to come.
+        chain: The draft of the current chunk.
+    """
+
+    def __init__(self, settings: StreakSkipSettings, context: Context) -> None:
+        """Take the drafts of the method's prefill draft, or of its first source."""
+        from kerv_cli.methods.merged import MergedProposer
+
+        draft = context.built["prefill_draft"]
+        self.settings = settings
+        self.source: ChainProposer = draft.sources[0] if isinstance(draft, MergedProposer) else draft
+        self.allowed = self.left = 0
+        self.chain: tuple[int, ...] = ()
+
+    def begin(self, task: str, seed: int) -> None:
+        """Begin an episode. Its first decodes may go unverified, as many as the setting `opening` says."""
+        self.allowed = self.left = self.settings.opening
+
+    def take(self, chunk: Chunk) -> SkipDecision:
+        """Take the draft, unverified, if one more such decode is allowed and the draft has all N tokens."""
+        chains = self.source.chains(chunk, chunk.size)
+        self.chain = tuple(chains[0]) if chains else ()
+        if not self.left or len(self.chain) < chunk.size:
+            return SkipDecision(reason=STREAK)
+        self.left -= 1
+        return SkipDecision(self.chain, self.source.name, TRUSTED)
+
+    def verified(self, chunk: Chunk) -> None:
+        """Double the number of decodes allowed without verification if the verified draft agrees; else set it to 0."""
+        self.allowed = min(self.settings.most, 2 * self.allowed or 1) if self._agrees(chunk) else 0
+        self.left = self.allowed
+
+    def _agrees(self, chunk: Chunk) -> bool:
+        """Return whether the draft was accepted whole, or differs from the target's tokens by at most `tolerance`.
+
+        The difference is the mean absolute difference, in normalised action units. Tokens of strict DoFs, such as the
+        gripper, must be equal. The result is False if the draft was not verified.
+        """
+        targets = chunk.targets_along(self.chain)
+        if targets is None:
+            return False
+        if chunk.rounds[-1].accepted == len(chunk.rounds[-1].drafted):
+            return True
+        tolerance = self.settings.tolerance
+        return tolerance > 0 and chunk.distance(self.chain[: len(targets)], targets) <= tolerance
+
+
+@SkipPart("always", takes_draft=True, verifies=False, batchable=True, any_code=True)
+class AlwaysSkip(Skip):
+    """Executes every draft without verification. If there is no draft of a whole chunk, the target decodes."""
+
+    def __init__(self, source: ChainProposer) -> None:
+        self.source = source
+
+    @classmethod
+    def build(cls, settings: NoSettings, context: Context) -> AlwaysSkip:
+        """Build the part that the setting `skip=always` chooses."""
+        return cls(context.built["prefill_draft"])
+
+    def take(self, chunk: Chunk) -> SkipDecision:
+        """Take the draft, without verification, if it has all N tokens."""
+        chains = self.source.chains(chunk, chunk.size)
+        if not chains or len(chains[0]) < chunk.size:
+            return SkipDecision()
+        return SkipDecision(chains[0], self.source.name)
+
+
+@dataclass
+class SpeedSkipSettings:
+    """SP-VLA: while the hand is fast, execute a chunk that a ridge regression predicts from the last actions."""
+
+    kind: str = "speed"
+    v_min: float = number(0.3, 0, 1000)  # lowest hand speed at which the regression is used, metres per second
+    v_max: float = number(1000.0, 0, 1000)  # highest hand speed at which the regression is used
+    buffer: int = number(6, 2, 10)  # number of last actions that the regression reads (paper: n)
+    share: float = number(0.5, 0, 1)  # the target must have decoded more than this share of them (paper: τ)
+    penalty: float = number(1e-4, 0, 1e6)  # ridge penalty λ
+
+    def check_together(self, prefix: str) -> None:
+        """Refuse a `v_min` above `v_max`.
+
+        Raises:
+            UsageError: `v_min` is above `v_max`.
+        """
+        if self.v_min > self.v_max:
+            raise UsageError(f"skip.v_min={self.v_min:g} skip.v_max={self.v_max:g}: v_min must not be above v_max")
+
+
+@SkipPart("speed", SpeedSkipSettings, colour=0x8C6D31)
+class SpeedSkip(Skip):
+    """SP-VLA: executes a predicted chunk if the hand is fast and the target decoded enough of the last actions.
+
+    Otherwise the target decodes the chunk. The prediction is a ridge regression on the last `buffer` executed actions.
+
+    Attributes:
+        decoded: For each of the last `buffer` actions, whether the target decoded it.
+        executed: Number of actions executed in this episode.
+        by_target: Whether the target decoded the last chunk. If not, the chunk was predicted.
+    """
+
+    def __init__(self, settings: SpeedSkipSettings, context: Context) -> None:
+        """Compute the weights of the regression."""
+        from kerv_cli.methods.kerv.prediction import Ridge
+
+        self.settings, target = settings, context.target
+        self.ridge = Ridge(target.actions.is_strict, settings.penalty, settings.buffer, target.chunk)
+        self.decoded: deque[bool] = deque(maxlen=settings.buffer)
+        self.executed, self.by_target = 0, True
+
+    def begin(self, task: str, seed: int) -> None:
+        """Begin an episode: forget the last actions."""
+        self.decoded.clear()
+        self.executed, self.by_target = 0, True
+
+    def take(self, chunk: Chunk) -> SkipDecision:
+        """Return the predicted chunk if the hand is fast and the target decoded enough actions, else no chunk."""
+        path, s = chunk.situation.path, self.settings
+        self.decoded.extend([self.by_target] * (len(path) - 1 - self.executed))
+        self.executed = len(path) - 1
+        predicted = self.ridge.predict(chunk.situation.history.values(), chunk.steps)
+        self.by_target = True
+        if predicted is None:
+            return SkipDecision()
+        speed = chunk.space.control_hz * math.dist(path[-1], path[-2])
+        if not s.v_min <= speed <= s.v_max or sum(self.decoded) <= s.share * s.buffer:
+            return SkipDecision()
+        self.by_target = False
+        return SkipDecision(chunk.space.bins_of(predicted).flatten().tolist(), self.ridge.name)
