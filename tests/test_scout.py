@@ -100,8 +100,7 @@ def test_verified_strictly_its_drafts_change_no_token(target, scout):
 def test_packed_weights_give_the_same_draft(target, scout, views):
     inputs = target.inputs(observed(target, 0))
     inputs = dataclasses.replace(inputs, images=torch.cat([inputs.images, 255 - inputs.images][:views], -1))
-    shape = target.actions, target.observation, target.chunk, views, target.settings.image_size, target.words.size
-    made = ScoutNetwork(scout.settings, *shape).eval().requires_grad_(False)
+    made = ScoutNetwork(scout.settings, target, views).eval().requires_grad_(False)
     with torch.no_grad():
         for part in made.modules():
             if isinstance(part, (torch.nn.Linear, torch.nn.RMSNorm, torch.nn.GroupNorm)):

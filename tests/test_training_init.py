@@ -21,8 +21,7 @@ from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.folder import save_target
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.text import WordTokenizer
-from kerv_cli.training.dagger import PolicyActs
-from kerv_cli.training.demonstrations import open_demos
+from kerv_cli.training.demonstrations import PolicyActs, open_demos
 from kerv_cli.training.drafter import train_drafter
 from kerv_cli.training.fit import batches, identity_of
 from kerv_cli.training.settings import DemosSettings, TrainDrafterSettings, TrainSettings, TrainTargetSettings

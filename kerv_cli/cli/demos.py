@@ -25,8 +25,7 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
         kerv demos name=mine task=MT10 episodes=100
         kerv demos name=visited policy=vision task=reach --plan
     """
-    from kerv_cli.training.dagger import recording_of
-    from kerv_cli.training.demonstrations import name_of
+    from kerv_cli.training.demonstrations import name_of, recording_of
     from kerv_cli.worlds.demos.recording import record
 
     config, actor = recording_of(settings)

@@ -16,7 +16,7 @@ from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.drafters import TrainableDrafter
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import EagleDrafter
-from kerv_cli.methods.eagle.public import Convention, PublicDrafter, read_public
+from kerv_cli.methods.eagle.public import Convention, read_public
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_tasks, demos_for
@@ -86,8 +86,7 @@ def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Beg
             return drafter.validate(network, target, held_out, settings)
 
         def save(network: Any, metrics: Metrics) -> None:
-            figures = figures_of(dataset, network, metrics)
-            provenance = provenance_of("kerv train drafter", settings, device, **figures)
+            provenance = provenance_of("kerv train drafter", settings, device, **figures_of(dataset, network, metrics))
             drafter.save(folder, network, MadeFor.of(description), provenance, train.stored, settings=shape)
 
         with stage("training the drafter") as progress:
@@ -108,13 +107,11 @@ def import_drafter(settings: BuildDrafterSettings) -> tuple[Path, dict[str, Any]
     device, _ = set_up(settings.runtime)
     artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
     target: Any = artifacts.target
-    shape, tensors = read_public(Path(settings.checkpoint).expanduser(), target, convention)
-    folder, layers = artifacts.new(EagleDrafter.kind), shape.language.num_hidden_layers
-    network = PublicDrafter(shape)
-    network.load_state_dict(tensors, assign=True)  # the weights keep their number format
-    figures = {"parameters": sum(tensor.numel() for tensor in tensors.values())}
+    network = read_public(Path(settings.checkpoint).expanduser(), target, convention)
+    folder, layers = artifacts.new(EagleDrafter.kind), network.shape.language.num_hidden_layers
+    figures = {"parameters": sum(tensor.numel() for tensor in network.parameters())}
     provenance = provenance_of("kerv build drafter", settings, device, **figures)
     shapes = asdict(DrafterSettings(kind="public", layers=layers))
     made_for = MadeFor.of(artifacts.description)
-    EagleDrafter().save(folder, network, made_for, provenance, settings=shapes, public=asdict(shape))
+    EagleDrafter().save(folder, network, made_for, provenance, settings=shapes, public=asdict(network.shape))
     return folder, {**figures, "layers": layers, **asdict(convention)}

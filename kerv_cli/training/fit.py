@@ -7,6 +7,7 @@ optimiser's state and the metrics of all validations.
 
 from __future__ import annotations
 
+import copy
 import io
 import math
 import pickle
@@ -109,7 +110,7 @@ def fit(
 
 
 class State:
-    """The state of a training: weights, the average of the weights, optimiser, step and metrics.
+    """The state of a training: network, a copy of it with averaged weights, optimiser, step and metrics.
 
     Args:
         network: The network to train.
@@ -126,11 +127,7 @@ class State:
         vectors = [parameter for parameter in network.parameters() if parameter.dim() < 2]
         groups = [{"params": matrices, "weight_decay": settings.weight_decay}, {"params": vectors, "weight_decay": 0.0}]
         self.optimiser = torch.optim.AdamW(groups, lr=settings.lr, betas=(0.9, 0.95), fused=True)
-        self.average = self.copied()
-
-    def copied(self) -> dict[str, Tensor]:
-        """Return a copy of the network's present weights, by name."""
-        return {name: value.detach().clone() for name, value in self.network.state_dict().items()}
+        self.average = copy.deepcopy(network).eval()
 
     def update(self, loss: Loss) -> Metrics:
         """Do one optimiser step on one batch, and return its loss and the other metrics to log.
@@ -149,9 +146,9 @@ class State:
         nn.utils.clip_grad_norm_(self.network.parameters(), settings.clip)
         self.optimiser.step()
         decay = min(settings.ema, (1 + self.step) / (10 + self.step))
-        live = self.network.state_dict()
+        averaged, live = self.average.state_dict(), self.network.state_dict()
         with torch.no_grad():
-            torch._foreach_lerp_([self.average[name] for name in live], list(live.values()), 1 - decay)
+            torch._foreach_lerp_(list(averaged.values()), list(live.values()), 1 - decay)
         self.step += 1
         return metrics
 
@@ -167,16 +164,11 @@ class State:
             KervError: A metric is not finite.
             StorageError: The disk cannot be written.
         """
-        live = self.copied()
-        self.network.load_state_dict(self.average)
-        self.network.eval()
-        metrics = {"step": float(self.step), "train_loss": training_loss, **validate(self.network)}
+        metrics = {"step": float(self.step), "train_loss": training_loss, **validate(self.average)}
         check_finite(metrics, self.step)
         self.history.append(metrics)
         if metrics["score"] >= max(one["score"] for one in self.history):
-            save(self.network, metrics)
-        self.network.load_state_dict(live)
-        self.network.train()
+            save(self.average, metrics)
         self.store()
 
     def store(self) -> None:
@@ -186,7 +178,7 @@ class State:
             "step": self.step,
             "history": self.history,
             "model": self.network.state_dict(),
-            "ema": self.average,
+            "ema": self.average.state_dict(),
             "optimiser": self.optimiser.state_dict(),
         }
         buffer = io.BytesIO()
@@ -216,8 +208,7 @@ class State:
         state = read_state(path)
         self.network.load_state_dict(state["model"])
         self.optimiser.load_state_dict(state["optimiser"])
-        for name, average in self.average.items():
-            average.copy_(state["ema"][name])
+        self.average.load_state_dict(state["ema"])
         self.step, self.history = state["step"], state["history"]
         self.log()  # the process may have ended before it wrote the log
         if self.step < self.settings.steps:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from kerv_cli.base.config import compose, groups
-from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.registry import ArtifactPart
 from kerv_cli.catalogue.entries import state_of
 from kerv_cli.episodes.resolve import resolve
@@ -88,31 +88,26 @@ def needs(methods: tuple[str, ...], sees: bool, runnable: bool = True) -> tuple[
         UnknownName: A method does not exist.
         UsageError: A method needs an artifact that only a target with cameras can have.
     """
-    names = groups()["method"]
-    for name in methods:
-        if name not in names:
-            raise UnknownName("method", name, names)
     artifacts = ArtifactPart.every()
-    seeing = {kind for kind, part in artifacts.items() if part.sees}
     kinds: set[str] = set()
-    for name in methods or names:
-        method = Method.of(compose("rollout", [f"method={name}"], RolloutSettings))
-        if methods and not sees and seeing & set(method.needs):
+    for name in methods or groups()["method"]:
+        needed = Method.of(compose("rollout", [f"method={name}"], RolloutSettings)).needs
+        if methods and not sees and any(artifacts[kind].sees for kind in needed):
             raise UsageError(f"for={name}: it needs a target that sees, this one reads the state")
-        kinds |= set(method.needs)
-    studies = {kind: part.study for kind, part in artifacts.items() if part.study}
-    if sees and runnable:
-        for kind in kinds & set(studies):
-            for settings in resolve([f"study={studies[kind]}"]).settings.values():
-                kinds |= set(Method.of(settings).needs)
-    if not sees:
-        kinds -= seeing
-    if not runnable:
-        kinds -= set(studies)
+        kinds.update(needed)
+    for study in [artifacts[kind].study for kind in kinds]:
+        if study and sees and runnable:
+            for settings in resolve([f"study={study}"]).settings.values():
+                kinds.update(Method.of(settings).needs)
     order: list[str] = []
     for kind, part in artifacts.items():
         order += [*part.needed(None), kind]
-    return tuple(kind for kind in dict.fromkeys(order) if kind in kinds and kind_of(kind).command)
+    made = []
+    for kind in dict.fromkeys(order):
+        possible = (sees or not artifacts[kind].sees) and (runnable or not artifacts[kind].study)
+        if kind in kinds and possible and kind_of(kind).command:
+            made.append(kind)
+    return tuple(made)
 
 
 def _state(artifacts: Artifacts, database: Database, kind: str, kinds: Sequence[str]) -> str:

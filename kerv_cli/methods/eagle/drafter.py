@@ -193,21 +193,17 @@ class DrafterProposer(Proposer):
             hidden = hidden[:, rows]
             seen = torch.cat([seen[rows], itself], 1)
         self.cache.length = base
-        return _best(torch.cat(every), torch.cat(parents), torch.cat(cumulative), self.nodes, depth)
+        # the sort is stable and children come after their parents, so at equal scores the parent is kept
+        best = torch.cat(cumulative).sort(descending=True, stable=True).indices[: self.nodes].sort().values
+        index = torch.full((offset + 1,), ROOT, device=device)  # the last entry is the root
+        index[best] = torch.arange(best.shape[0], device=device)
+        return Draft(torch.cat(every)[best], index[torch.cat(parents)[best]], depth)
 
 
 def _most(scores: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Return the `count` highest scores in the last dimension, and their indices. Of equal scores the first wins."""
     values, indices = scores.sort(dim=-1, descending=True, stable=True)
     return values[..., :count], indices[..., :count]
-
-
-def _best(tokens: Tensor, parents: Tensor, scores: Tensor, nodes: int, depth: int) -> Draft:
-    # the sort is stable and children come after their parents, so at equal scores the parent is kept
-    best = scores.sort(descending=True, stable=True).indices[:nodes].sort().values
-    index = torch.full((tokens.shape[0] + 1,), ROOT, device=tokens.device)  # the last entry is the root
-    index[best] = torch.arange(best.shape[0], device=tokens.device)
-    return Draft(tokens[best], index[parents[best]], depth)
 
 
 @dataclass(frozen=True)
@@ -307,7 +303,8 @@ class EagleDrafter(TrainableDrafter):
         """Return the loss and the metrics to log, for B examples with prompts of one length.
 
         The first pass reads the target's hidden states. Each later pass reads the drafter's own predictions of the pass
-        before, as in drafting.
+        before, as in drafting. The loss is the weighted sum of two: the smooth L1 loss of the states, and the
+        cross-entropy of the drafter's token distribution with the target's.
 
         Args:
             network: The drafter.
@@ -323,11 +320,20 @@ class EagleDrafter(TrainableDrafter):
         following = torch.cat([prompt[:, 1:], target.embed(tokens[:, :-1])], 1)
         positions = torch.arange(hidden.shape[1] - 1, device=device)
         total, metrics = hidden.new_zeros(()), {}
+        # with an end token, only the positions before it are compared
         counted = (tokens[:, :-1] == target.actions.end).cumsum(1) == 0 if target.actions.code else None
         inputs = hidden[:, :-1]
         for number in range(settings.unroll):
             predicted = network(following, inputs, positions)
-            state_loss, token_loss = compared(target, predicted[:, length - 1 :], hidden[:, length:], counted)
+            guessed, states = predicted[:, length - 1 :], hidden[:, length:]  # of the chunk's tokens 1 to N − 1
+            if counted is not None:
+                guessed, states = guessed[counted], states[counted]
+            teacher, logits = (
+                target.head(states.to(target.dtype)).float(),
+                target.head(guessed.to(target.dtype)).float(),
+            )
+            token_loss = -(teacher.softmax(-1) * F.log_softmax(logits, -1)).sum(-1).mean()
+            state_loss = F.smooth_l1_loss(guessed, states)
             total = total + settings.state_weight * state_loss + settings.token_weight * token_loss
             metrics[f"token_loss_{number}"] = float(token_loss.detach())
             # after the first drafted position the next pass reads its own predictions, as in drafting
@@ -345,27 +351,6 @@ class EagleDrafter(TrainableDrafter):
         loaded = copy.deepcopy(network).to(target.dtype)
         strict, relaxed = (acceptance_length(target, loaded, prompts, r) for r in (0, 9))
         return {"score": relaxed + strict, "acceptance_length_strict": strict, "acceptance_length_r9": relaxed}
-
-
-def compared(
-    target: ReadableTarget, predicted: Tensor, hidden: Tensor, counted: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """Compare predicted hidden states with the target's, at the chunk's tokens 1 to N − 1.
-
-    Args:
-        target: The target.
-        predicted: (B, N − 1, E) states that the drafter predicts.
-        hidden: (B, N − 1, E) the target's states.
-        counted: (B, N − 1) bool, which positions are compared (those before the end token). None: all positions.
-
-    Returns:
-        The smooth L1 loss of the states, and the cross-entropy of the drafter's token distribution with the target's.
-    """
-    if counted is not None:
-        predicted, hidden = predicted[counted], hidden[counted]
-    teacher, logits = (target.head(states.to(target.dtype)).float() for states in (hidden, predicted))
-    cross_entropy = -(teacher.softmax(-1) * F.log_softmax(logits, -1)).sum(-1).mean()
-    return F.smooth_l1_loss(predicted, hidden), cross_entropy
 
 
 def acceptance_length(target: Target, network: EagleNetwork, prompts: list[Tensor], r: int) -> float:

@@ -150,16 +150,13 @@ class PublicDrafter(DraftNetwork):
         return mask
 
 
-def read_public(folder: Path, target: ReadableTarget, convention: Convention) -> tuple[PublicShape, dict[str, Tensor]]:
-    """Read a published drafter, without its copy of the target's embeddings.
+def read_public(folder: Path, target: ReadableTarget, convention: Convention) -> PublicDrafter:
+    """Read a published drafter, without its copy of the target's embeddings. The weights keep their number format.
 
     Args:
         folder: Folder with `config.json` and `model.safetensors`.
         target: The target for which the drafter drafts.
         convention: How the drafter differs from our own.
-
-    Returns:
-        The drafter's shape, and its tensors by name.
 
     Raises:
         CheckpointError: The folder is incomplete, damaged or pickled, or the drafter has another width than the target.
@@ -173,10 +170,12 @@ def read_public(folder: Path, target: ReadableTarget, convention: Convention) ->
     if language.hidden_size != target.width:
         raise CheckpointError(f"the drafter in {folder} is {language.hidden_size} wide, the target {target.width}")
     shards = open_shards(folder)
-    skipped = target.segments["vision"] if "vision" in target.segments else slice(0, 0)
-    shape = PublicShape(language, "fc.bias" in shards.shapes, convention, skipped.stop - skipped.start)
-    layout = {name: sizes for name, sizes in shards.shapes.items() if name != EMBEDDING}
+    vision = target.segments.get("vision", slice(0, 0))
+    shape = PublicShape(language, "fc.bias" in shards.shapes, convention, vision.stop - vision.start)
     with torch.device("meta"):
-        wanted = sizes_of(PublicDrafter(shape))
-    check_layout(layout, wanted, folder)
-    return shape, {name: tensor for name, tensor in shards.items() if name != EMBEDDING}
+        network = PublicDrafter(shape)
+    layout = dict(shards.shapes)
+    layout.pop(EMBEDDING, None)
+    check_layout(layout, sizes_of(network), folder)
+    network.load_state_dict({name: tensor for name, tensor in shards.items() if name != EMBEDDING}, assign=True)
+    return network

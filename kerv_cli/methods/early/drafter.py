@@ -367,40 +367,29 @@ class ScoutNetwork(Compilable):
     centre: Tensor
     compiled: Program | None
 
-    def __init__(
-        self,
-        settings: ScoutSettings,
-        actions: ActionSpace,
-        observation: ObservationSpace,
-        chunk: int,
-        views: int,
-        size: int,
-        words: int,
-    ) -> None:
+    def __init__(self, settings: ScoutSettings, target: Any, views: int) -> None:
         """Build the network.
 
         Args:
             settings: Shapes of the network.
-            actions: The action space.
-            observation: The observation space.
-            chunk: Number of control steps per chunk.
+            target: The target: a `Target` that is a `LocatesPlaces`.
             views: Number of camera views in the image, side by side.
-            size: Width and height of a view, in pixels.
-            words: Number of words in the target's vocabulary.
         """
         super().__init__()
         s = self.settings = settings
-        self.observation, self.size = observation, size
+        observation = self.observation = target.observation
+        size = self.size = target.frame_shape[0]
         self.register_buffer("centre", torch.tensor(observation.centre), persistent=False)
         self.stems = nn.ModuleList(
             VisionEncoder(size, s.grid, s.keypoints, s.channels, s.cell_width, "instance") for _ in range(views)
         )
         self.cells = nn.Linear(s.cell_width, s.cell_features)
-        self.words = nn.Embedding(words, s.word_width)
+        self.words = nn.Embedding(target.words.size, s.word_width)
         p, places = len(observation.proprioception), len(observation.places)
         self.locate = mlp(2 * s.keypoints * views + p + s.word_width, 128, 64, 3 * places)
         of_views = (s.cell_width + s.grid**2 * s.cell_features) * views
-        self.drafter = EarlyNetwork(s, actions, chunk, of_views + s.word_width + scene_width(observation))
+        features = of_views + s.word_width + scene_width(observation)
+        self.drafter = EarlyNetwork(s, target.actions, target.chunk, features)
 
     def forward(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
         """Return the logits (B, N, V), and the estimated positions of object and goal (B, K, 3), in metres."""
@@ -522,9 +511,8 @@ class ScoutDrafter(EarlyDrafter):
         Raises:
             CheckpointError: The target has no camera.
         """
-        size, width, _ = check_sees(target).frame_shape
-        shape = width // size, size, target.words.size
-        return ScoutNetwork(settings, target.actions, target.observation, target.chunk, *shape)
+        height, width, _ = check_sees(target).frame_shape
+        return ScoutNetwork(settings, target, width // height)
 
     @classmethod
     def proposer(cls, settings: NoSettings, context: Context) -> ScoutProposer:

@@ -7,6 +7,7 @@ verification.
 
 from __future__ import annotations
 
+import math
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 
 MANIFEST = "manifest.json"
 LEAST = 3  # minimum number of positions for a curvature
+ROUNDING = 1e-5  # largest rounding error of a float32 dot product of two unit vectors
 
 
 # --- the datastore and its proposer (§4.1, §4.2)
@@ -72,11 +74,23 @@ class Index(ABC):
 
 
 @registry.SearchPart("exact")
-def exact(store: Datastore, settings: Any) -> Index:
-    """Return the search that datastore=exact (the default) chooses. It compares a key with all entries of the task."""
-    from kerv_cli.methods.heisd.datastore import ExactIndex
+class ExactIndex(Index):
+    """datastore=exact, the default: compare the key with all entries of the task, in this process."""
 
-    return ExactIndex(store, settings)
+    def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
+        """Return the k most similar rows, and all other rows that could be among them but for rounding errors.
+
+        `Index.candidates` explains the arguments.
+        """
+        import numpy as np
+
+        shard = self.store.shards[task]
+        scores = self.store.vectors[shard] @ key
+        if without is not None:
+            scores[self.store.seeds[shard] == without] = -np.inf
+        least = np.partition(scores, -k)[-k] if k <= len(scores) else -np.inf
+        slack = ROUNDING * self.store.longest * math.sqrt(key @ key)
+        return np.flatnonzero((scores >= least - slack) & (scores > -np.inf)) + shard.start
 
 
 @dataclass

@@ -15,7 +15,6 @@ Shapes: B observations, P prompt tokens, E width of the target, d numbers of a k
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -39,7 +38,6 @@ from kerv_cli.worlds import spec_of
 VECTORS, PAYLOAD, PROJECTION = "vectors.npy", "payload.parquet", "projection.npy"
 COLUMNS = {"seeds": "seed", "steps": "step", "left": "left"}
 AGAIN = "build one with 'kerv build datastore'"
-ROUNDING = 1e-5  # largest rounding error of a float32 dot product of two unit vectors
 
 
 @dataclass(frozen=True)
@@ -164,23 +162,6 @@ def best(vectors: np.ndarray, rows: np.ndarray, key: np.ndarray, k: int) -> tupl
     scores = np.einsum("ij,j->i", vectors[rows].astype(np.float64), key.astype(np.float64)).astype(np.float32)
     order = np.argsort(-scores, kind="stable")[:k]
     return rows[order], scores[order]
-
-
-class ExactIndex(Index):
-    """datastore=exact, the default: compare the key with all entries of the task, in this process."""
-
-    def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return the k most similar rows, and all other rows that could be among them but for rounding errors.
-
-        `Index.candidates` explains the arguments.
-        """
-        shard = self.store.shards[task]
-        scores = self.store.vectors[shard] @ key
-        if without is not None:
-            scores[self.store.seeds[shard] == without] = -np.inf
-        least = np.partition(scores, -k)[-k] if k <= len(scores) else -np.inf
-        slack = ROUNDING * self.store.longest * math.sqrt(key @ key)
-        return np.flatnonzero((scores >= least - slack) & (scores > -np.inf)) + shard.start
 
 
 @dataclass(frozen=True)

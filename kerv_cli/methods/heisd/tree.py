@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
 from heapq import heappop, heappush
 from itertools import count
 
@@ -43,20 +42,46 @@ def neighbour_tree(
         cross: Probability of a change after a group. 0: paths never change, so only whole chunks are merged.
     """
     stop = chunks.shape[1] if depth is None else min(chunks.shape[1], start + depth)
-    continuations = _Continuations(chunks.tolist(), list(space.segments(start, stop)), cross)
+    # sets of neighbours are numbers, whose bits stand for neighbours
+    everyone = (1 << len(chunks)) - 1
+    levels: list[tuple[bool, list[tuple[tuple[int, ...], int]]]] = []  # is strict; each group, and who has it
+    for first, end, strict in space.segments(start, stop):
+        givers: dict[tuple[int, ...], int] = {}
+        for i, row in enumerate(chunks[:, first:end].tolist()):
+            givers[tuple(row)] = givers.get(tuple(row), 0) | 1 << i
+        levels.append((strict, list(givers.items())))
     tokens: list[int] = []
     parents: list[int] = []
     children: dict[tuple[int, int], int] = {}
     # groups to add: (−log probability of their path, order of offers, parent node, number of groups before, tokens,
-    # `last` and `whole` as in _Continuations)
+    # `last` and `whole` as in `offer`)
     waiting: list[tuple[float, int, int, int, tuple[int, ...], int, int]] = []
     order = count()
 
     def offer(parent: int, level: int, last: int, whole: int, cost: float) -> None:
-        for surprise, group, members, common in continuations.on(level, last, whole):
-            heappush(waiting, (cost + surprise, next(order), parent, level, group, members, common))
+        """Offer the groups that may come next on a path, those of the most similar neighbours first.
 
-    offer(ROOT, 0, continuations.everyone, continuations.everyone, 0.0)
+        Args:
+            parent: Last node of the path.
+            level: Number of groups on the path.
+            last: The neighbours that have the last group.
+            whole: The neighbours that have every group. If there are none, `last`.
+            cost: −log probability of the path.
+        """
+        strict, givers = levels[level] if level < len(levels) else (False, [])
+        pool = last if strict else everyone
+        if strict:
+            givers = [(group, members & last) for group, members in givers if members & last]
+            givers.sort(key=lambda way: way[1] & -way[1])
+        for group, members in givers:
+            common = members & whole
+            chance = (1 - cross) * _weight(common) / _weight(whole) + cross * _weight(members) / _weight(pool)
+            if chance > 0:
+                heappush(
+                    waiting, (cost - math.log(chance), next(order), parent, level, group, members, common or members)
+                )
+
+    offer(ROOT, 0, everyone, everyone, 0.0)
     while waiting and len(tokens) < nodes:
         cost, _, node, level, group, last, whole = heappop(waiting)
         known = 0  # number of leading tokens of the group that are in the tree already
@@ -78,55 +103,3 @@ def neighbour_tree(
 def _weight(members: int) -> float:
     """Return the summed weight of the neighbours in a bit set. The i-th neighbour, counted from 1, has weight 1 / i."""
     return sum([1 / (1 + i) for i in range(members.bit_length()) if members >> i & 1])
-
-
-class _Continuations:
-    """Lists the kinematic groups of tokens that may come next on a path of the tree, with their probabilities.
-
-    Retrieval returns stored chunks, the neighbours. Their tokens are cut into kinematic groups. A caller describes the
-    groups chosen so far by two sets of neighbours, `last` and `whole`, whose bits stand for neighbours. `last` has the
-    neighbours whose chunk contains the last chosen group. `whole` has those whose chunk contains every chosen group. If
-    there are none, `whole` is set to `last`.
-
-    Args:
-        rows: Tokens of each neighbour's chunk, most similar neighbour first.
-        cuts: For each group: index of its first token, index after its last token, whether its DoFs are strict.
-        cross: Probability that a path changes to another neighbour after a group.
-    """
-
-    def __init__(self, rows: list[list[int]], cuts: list[tuple[int, int, bool]], cross: float) -> None:
-        self.everyone = (1 << len(rows)) - 1
-        self.cross = cross
-        self.levels: list[tuple[bool, list[tuple[tuple[int, ...], int]]]] = []
-        for first, last, strict in cuts:
-            givers: dict[tuple[int, ...], int] = {}
-            for i, row in enumerate(rows):
-                group = tuple(row[first:last])
-                givers[group] = givers.get(group, 0) | 1 << i
-            self.levels.append((strict, list(givers.items())))
-
-    def on(self, level: int, last: int, whole: int) -> Iterator[tuple[float, tuple[int, ...], int, int]]:
-        """List the groups that may be chosen next, those of the most similar neighbours first.
-
-        Args:
-            level: Number of groups chosen so far.
-            last: Bit set of the neighbours that have the last chosen group.
-            whole: Bit set of the neighbours that have every chosen group.
-
-        Yields:
-            (−log probability of the group, its tokens, and `last` and `whole` if this group is chosen).
-        """
-        if level == len(self.levels):
-            return
-        strict, givers = self.levels[level]
-        pool = self.everyone
-        if strict:
-            pool = last
-            givers = [(group, members & last) for group, members in givers if members & last]
-            givers.sort(key=lambda way: way[1] & -way[1])
-        cross, of_whole, of_pool = self.cross, _weight(whole), _weight(pool)
-        for group, members in givers:
-            common = members & whole
-            probability = (1 - cross) * _weight(common) / of_whole + cross * _weight(members) / of_pool
-            if probability > 0:
-                yield -math.log(probability), group, members, common or members
