@@ -15,6 +15,7 @@ from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import Proposer
+from kerv_cli.methods.context import Context
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early.drafter import EarlyProposer
@@ -23,6 +24,7 @@ from kerv_cli.methods.heisd import (
     Random,
     RandomBoundarySettings,
     RetrievalProposer,
+    RetrievalProposerSettings,
     SimilaritySkipSettings,
     VerifySkip,
 )
@@ -48,6 +50,12 @@ class KnownDraft:
         return torch.tensor([[*self.tokens, self.odds]], dtype=torch.float64)
 
 
+def retrieval_of(store: Datastore, target: CompactTarget, neighbours: int, nodes: int) -> RetrievalProposer:
+    """The proposer that drafts from this datastore."""
+    settings = RetrievalProposerSettings(neighbours=neighbours, nodes=nodes)
+    return RetrievalProposer(settings, Context(target, lambda kind: store))
+
+
 def stored(target: CompactTarget, prompt: torch.Tensor, chunks: np.ndarray, left: int = 50) -> Datastore:
     """A datastore whose entries lie around this prompt's key; entry i is of episode i."""
     random = np.random.default_rng(0)
@@ -71,7 +79,7 @@ def proposers(target: CompactTarget, prompt: torch.Tensor, truth: list[int], see
     horizon = target.chunk
     wrong = np.array([truth] * 4)
     wrong[random.random(wrong.shape) < 0.2] = random.integers(255)
-    retrieval = RetrievalProposer(stored(target, prompt, wrong), target, 3, 40)
+    retrieval = retrieval_of(stored(target, prompt, wrong), target, 3, 40)
     drafter = EagleDrafter().network(DrafterSettings(), target).eval().requires_grad_(False)
     drafting = DrafterProposer(drafter, target, depth=4, top_k=2, nodes=6)
     hold = PredictionProposer(Hold(HELD, minimum=1, horizon=horizon))
@@ -154,7 +162,7 @@ def skipping(left: int = 50, **changes: Any) -> tuple[Decoder, torch.Tensor, lis
     prompt = random_prompt(target, 2)
     tokens = list(range(16))
     store = stored(target, prompt, np.array([tokens]), left)
-    retrieval = RetrievalProposer(store, target, 1, 16)
+    retrieval = retrieval_of(store, target, 1, 16)
     skip = VerifySkip(SimilaritySkipSettings(**changes), retrieval, (0.4, 0.5, 0.9))
     decoder = Decoder(target, Parts(proposer=retrieval, skip=skip))
     decoder.situation = situation(np.random.default_rng(0), 3)

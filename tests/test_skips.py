@@ -9,7 +9,7 @@ import pytest
 import torch
 from mock_target import SEVEN, MockTarget
 from test_decoding_lossless import plain_greedy, random_prompt, random_target
-from test_proposers import stored
+from test_proposers import retrieval_of, stored
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.spaces import Observation
@@ -21,7 +21,7 @@ from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.heisd import RetrievalProposer, SimilaritySkipSettings, VerifySkip
+from kerv_cli.methods.heisd import SimilaritySkipSettings, VerifySkip
 from kerv_cli.methods.kerv.prediction import Hold, PredictionProposer, Ridge
 from kerv_cli.methods.merged import MergedProposer
 from kerv_cli.methods.unverified import AlwaysSkip, SpeedSkip, SpeedSkipSettings, StreakSkip, StreakSkipSettings
@@ -169,7 +169,7 @@ def swept(blocks: list[list[int]]) -> dict[int, list[tuple[int, ...]]]:
     level = float(np.median(every))
     records = {}
     for block in blocks:
-        retrieval = RetrievalProposer(store, target, 1, 16)
+        retrieval = retrieval_of(store, target, 1, 16)
         levels = (level - 0.2, level, level + 0.2)
         skip = VerifySkip(SimilaritySkipSettings(max_skips=2), retrieval, levels)
         decoder = Decoder(target, Parts(proposer=retrieval, skip=skip))

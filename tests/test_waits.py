@@ -11,7 +11,7 @@ import pytest
 import torch
 from pretended_device import DEVICE, Device, move
 from test_decoding_lossless import random_prompt, random_target
-from test_proposers import HELD, D, situation, stored
+from test_proposers import HELD, D, retrieval_of, situation, stored
 
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.record import PHASES
@@ -20,7 +20,7 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter, EagleNetwork
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
-from kerv_cli.methods.heisd import HybridProposer, Random, RandomBoundarySettings, RetrievalProposer
+from kerv_cli.methods.heisd import HybridProposer, Random, RandomBoundarySettings
 from kerv_cli.methods.kerv.prediction import Hold, Kalman, Noise, PredictionProposer
 from kerv_cli.methods.merged import MergedProposer
 from kerv_cli.methods.reuse import JacobiProposer, JacobiProposerSettings
@@ -33,7 +33,7 @@ def parts_of(family: str, target: Any, prompt: torch.Tensor, truth: list[int]) -
     """Untrained drafters and a few stored chunks, one of them right at first: there are rejections and rounds."""
     wrong = np.array([truth] * 3)
     wrong[:, 3:] = (wrong[:, 3:] + [[1], [2], [0]]) % 255
-    retrieval = RetrievalProposer(stored(target, prompt, wrong), target, 3, 24)
+    retrieval = retrieval_of(stored(target, prompt, wrong), target, 3, 24)
     torch.manual_seed(1)
     drafter = EagleDrafter().network(DrafterSettings(), target).eval().requires_grad_(False)
     network = EarlyDrafter().network(EarlySettings(width=16, layers=1, rank=4), target).eval()

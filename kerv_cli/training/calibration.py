@@ -27,16 +27,8 @@ from kerv_cli.engine.decoder import Decoder
 from kerv_cli.engine.record import MEAN, MEASURES, DecodeRecord, variability
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database
+from kerv_cli.methods import calibration as stored
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
-from kerv_cli.methods.calibration import (
-    NEVER,
-    BoundarySection,
-    Calibration,
-    Demonstrations,
-    SkipLevel,
-    SkipSection,
-    Variability,
-)
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.heisd.curvature import BoundaryRanges
 from kerv_cli.methods.heisd.datastore import Datastore
@@ -75,7 +67,7 @@ DAMPINGS = (0.95, 0.9, 0.85, 0.8, 0.75, 0.7, 0.6, 0.5, 0.3)
 
 def calibrate(
     settings: CalibrateSettings, database: Database, begin: Begin = quietly
-) -> tuple[Path, Calibration, list[str]]:
+) -> tuple[Path, stored.Calibration, list[str]]:
     """Measure the sections of a calibration that the settings allow, and write them to its JSON file.
 
     The reference levels K_S of the kinematic variability are not measured if `decodes` is 0 or the drafter is missing.
@@ -108,7 +100,7 @@ def calibrate(
     missing = [kind for kind in ("drafter", "datastore") if not artifacts.exists(kind)]
     if "datastore" not in missing:
         artifacts.check(["datastore"])
-    old: Calibration | None = artifacts.load("calibration") if settings.complete else None
+    old: stored.Calibration | None = artifacts.load("calibration") if settings.complete else None
     # a shipped calibration may be completed, and skip levels may be added to it
     path = artifacts.path("calibration")
     lacks_skip = "datastore" not in missing and path.is_file() and read_mapping(path).get("skip") is None
@@ -126,7 +118,7 @@ def calibrate(
         past, future, paths, counts = read_windows(
             dataset, chosen, target.actions, settings.window, target.chunk, progress
         )
-    variability: dict[str, Variability] = {}
+    variability: dict[str, stored.Variability] = {}
     notes: list[str] = []
     if settings.decodes and "drafter" not in missing:
         decoder = method.decoder(artifacts.target, artifacts.load)
@@ -145,9 +137,9 @@ def calibrate(
         boundary = fit_boundary(paths, settings.boundary_windows, old, progress)
     with stage("fitting the predictors"):
         noise = fit_filters(past, future)
-    calibration = Calibration(
+    calibration = stored.Calibration(
         target=MadeFor.of(target),
-        demos=Demonstrations(dataset.sha256, counts),
+        demos=stored.Demonstrations(dataset.sha256, counts),
         window=settings.window,
         noise=noise,
         variability=variability,
@@ -168,7 +160,7 @@ def presample(
     tasks: Sequence[str],
     decodes: int,
     progress: OnProgress,
-) -> dict[str, Variability]:
+) -> dict[str, stored.Variability]:
     """Measure how far drafts are from the target's tokens, by decoding observations of training episodes.
 
     Args:
@@ -200,7 +192,7 @@ def presample(
     return variability
 
 
-def reference_level(records: Sequence[DecodeRecord], actions: ActionSpace, chunk: int) -> Variability:
+def reference_level(records: Sequence[DecodeRecord], actions: ActionSpace, chunk: int) -> stored.Variability:
     """Return a task's reference level K_S: the median of the variability K over the decodes, for each measure of K.
 
     Decoding divides by K_S, so it must not be 0. It is at least the smallest possible K above 0, which is the K of a
@@ -218,7 +210,7 @@ def reference_level(records: Sequence[DecodeRecord], actions: ActionSpace, chunk
         known = found[~np.isnan(found)]  # NaN: no draft token counts
         median = float(np.median(known)) if len(known) else 0.0
         levels[measure.name] = max(median, bin_width if measure.total else bin_width / moving)
-    return Variability(levels[MEAN.name], len(records), levels)
+    return stored.Variability(levels[MEAN.name], len(records), levels)
 
 
 def episode_decodes(decoder: Decoder, dataset: DemoDataset, index: int, decodes: int) -> list[DecodeRecord]:
@@ -249,8 +241,8 @@ def episode_decodes(decoder: Decoder, dataset: DemoDataset, index: int, decodes:
 
 
 def fit_boundary(
-    paths: list[np.ndarray], windows: Sequence[int], old: Calibration | None, progress: OnProgress
-) -> BoundarySection:
+    paths: list[np.ndarray], windows: Sequence[int], old: stored.Calibration | None, progress: OnProgress
+) -> stored.BoundarySection:
     """Return the ranges of curvature and path length, for each window length.
 
     Args:
@@ -268,10 +260,10 @@ def fit_boundary(
     for number, window in enumerate(windows, 1):
         ranges[str(window)] = BoundaryRanges.fit(paths, window, known.get(str(window)))
         progress(number, len(windows))
-    return BoundarySection(len(paths), ranges)
+    return stored.BoundarySection(len(paths), ranges)
 
 
-def completed(old: Calibration, new: Calibration) -> Calibration:
+def completed(old: stored.Calibration, new: stored.Calibration) -> stored.Calibration:
     """Return the old calibration, completed with the numbers of the new one that the old one lacks.
 
     The boundary ranges are those of `new`, because `fit_boundary` has already copied the old ranges into `new`.
@@ -471,7 +463,7 @@ def lowest_level(matches: Matches, confidence: float, least: int = LEAST) -> flo
     return float(ranked[enough][-1]) if enough.any() else None
 
 
-def task_levels(matches: Matches, confidence: float) -> SkipLevel:
+def task_levels(matches: Matches, confidence: float) -> stored.SkipLevel:
     """Return a task's s_min, the smallest similarity at which verification is skipped, and its bounds.
 
     In a rollout, feedback after each episode may move s_min between the bounds `low` and `high`. Each of the three is
@@ -487,10 +479,10 @@ def task_levels(matches: Matches, confidence: float) -> SkipLevel:
     similarity, wrong = matches.similarity, 1 - confidence
     s_min = lowest_level(matches, confidence)
     if s_min is None:
-        return SkipLevel(NEVER, NEVER, NEVER, share=0.0, entries=len(similarity))
+        return stored.SkipLevel(stored.NEVER, stored.NEVER, stored.NEVER, share=0.0, entries=len(similarity))
     low, high = lowest_level(matches, 1 - wrong * LOW), lowest_level(matches, 1 - wrong * HIGH)
     skipped = similarity >= s_min
-    return SkipLevel(
+    return stored.SkipLevel(
         s_min,
         low=s_min if low is None else min(low, s_min),
         high=float(similarity.max()) if high is None else max(high, s_min),
@@ -503,7 +495,7 @@ def task_levels(matches: Matches, confidence: float) -> SkipLevel:
 
 def skip_section(
     store: Datastore, tasks: Sequence[str], epsilon: float, confidence: float, progress: OnProgress
-) -> SkipSection | None:
+) -> stored.SkipSection | None:
     """Return the thresholds at which verification is skipped, for each of `tasks` that the datastore holds.
 
     Args:
@@ -521,4 +513,4 @@ def skip_section(
         if task in store.shards:
             levels[task] = task_levels(match(store, task, epsilon), confidence)
         progress(done, len(tasks))
-    return SkipSection(store.manifest.content, epsilon, confidence, levels) if levels else None
+    return stored.SkipSection(store.manifest.content, epsilon, confidence, levels) if levels else None

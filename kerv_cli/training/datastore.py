@@ -20,18 +20,7 @@ from kerv_cli.base.runtime import set_up
 from kerv_cli.base.spaces import ObservationSpace
 from kerv_cli.lab.database import Database
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.heisd.datastore import (
-    MANIFEST,
-    PAYLOAD,
-    PROJECTION,
-    VECTORS,
-    Datastore,
-    Manifest,
-    Shard,
-    check_seeds,
-    projected,
-    prompt_key,
-)
+from kerv_cli.methods.heisd import datastore as stored
 from kerv_cli.targets.observations import observations_of, observed_steps, prompts_of, read_chunks
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import demos_for
@@ -45,7 +34,7 @@ BATCH = 128
 
 def build_datastore(
     settings: BuildDatastoreSettings, database: Database, begin: Begin = quietly
-) -> tuple[Path, Datastore]:
+) -> tuple[Path, stored.Datastore]:
     """Write a datastore and open it. An older datastore in the same folder is replaced at the end.
 
     Args:
@@ -71,7 +60,9 @@ def build_datastore(
     settings, dataset = demos_for(settings, artifacts.description, database)
     tasks = sorted(resolve_tasks(settings.task or list(dataset.manifest.tasks)))
     folder = artifacts.new("datastore")
-    is_store = (folder / MANIFEST).is_file() and read_mapping(folder / MANIFEST).get("kind") == "datastore"
+    is_store = (folder / stored.MANIFEST).is_file() and read_mapping(folder / stored.MANIFEST).get(
+        "kind"
+    ) == "datastore"
     if not is_store and (folder.is_file() or visible(folder)):
         raise UsageError(f"{folder} exists and is no datastore: give the new one another name")
     chosen: dict[str, list[int]] = {}
@@ -83,7 +74,7 @@ def build_datastore(
         episodes = [dataset.episodes[index] for index in chosen[task]]
         seeds[task] = [episode.seed for episode in episodes]
         number, steps = number + len(episodes), steps + sum(episode.steps for episode in episodes)
-    check_seeds(seeds, dataset.path)
+    stored.check_seeds(seeds, dataset.path)
     plan = (
         f"{count(number, 'demonstration')} of {count(len(tasks), 'task')}, {steps} control steps, through "
         f"{artifacts.folder}, keys from {' + '.join(settings.key)}"
@@ -91,7 +82,7 @@ def build_datastore(
 
     stage = begin("datastore", folder, f"{folder}: {plan}", 0)
     parts: list[dict[str, np.ndarray]] = []
-    shards: dict[str, Shard] = {}
+    shards: dict[str, stored.Shard] = {}
     rows, target = 0, artifacts.description
     with stage("encoding demonstrations") as progress:
         for name, indices in chosen.items():
@@ -101,12 +92,12 @@ def build_datastore(
                 parts.append(entries_of(artifacts.target, episode, space, settings.key))
                 rows += len(parts[-1]["step"])
                 progress(len(parts), number)
-            shards[name] = Shard((first, rows), tuple(seeds[name]))
+            shards[name] = stored.Shard((first, rows), tuple(seeds[name]))
 
     def write(new: Path) -> None:
         width = write_files(new, parts, settings)
-        files = [name for name in (PROJECTION, VECTORS, PAYLOAD) if (new / name).exists()]
-        manifest = Manifest(
+        files = [name for name in (stored.PROJECTION, stored.VECTORS, stored.PAYLOAD) if (new / name).exists()]
+        manifest = stored.Manifest(
             format=2,
             kind="datastore",
             key=tuple(settings.key),
@@ -120,10 +111,10 @@ def build_datastore(
             tasks=shards,
             provenance=provenance_of("kerv build datastore", settings, device),
         )
-        write_json(new / MANIFEST, asdict(manifest))
+        write_json(new / stored.MANIFEST, asdict(manifest))
 
     write_folder(folder, write)
-    return folder, Datastore.open(folder, target)
+    return folder, stored.Datastore.open(folder, target)
 
 
 @torch.inference_mode()
@@ -144,7 +135,7 @@ def entries_of(target: Any, episode: DemoEpisode, space: ObservationSpace, key: 
     tokens = target.actions.chunk_tokens(read_chunks(episode, steps, target.chunk))
     observations = observations_of(target, episode, steps, space)
     size = -(-len(steps) // -(-len(steps) // BATCH))  # equal batches
-    keys = [prompt_key(prompt, target, key).cpu().numpy() for prompt in prompts_of(target, observations, size)]
+    keys = [stored.prompt_key(prompt, target, key).cpu().numpy() for prompt in prompts_of(target, observations, size)]
     return {
         "task": np.full(len(steps), episode.task),
         "seed": np.full(len(steps), episode.seed),
@@ -168,9 +159,9 @@ def write_files(folder: Path, parts: Sequence[Mapping[str, np.ndarray]], setting
     if settings.components:
         # the orthonormal directions that keep most of the keys' squared length
         values, vectors = np.linalg.eigh(keys.T.astype(np.float64) @ keys)
-        arrays[PROJECTION] = vectors[:, np.argsort(-values)[: settings.components]].astype(np.float32)
-        keys = projected(keys, arrays[PROJECTION])
-    arrays[VECTORS] = keys.astype(np.float16 if settings.half else np.float32)
+        arrays[stored.PROJECTION] = vectors[:, np.argsort(-values)[: settings.components]].astype(np.float32)
+        keys = stored.projected(keys, arrays[stored.PROJECTION])
+    arrays[stored.VECTORS] = keys.astype(np.float16 if settings.half else np.float32)
     # write to memory first: on a full disk, numpy and pyarrow raise errors without an errno
     for name, array in arrays.items():
         buffer = io.BytesIO()
@@ -183,5 +174,5 @@ def write_files(folder: Path, parts: Sequence[Mapping[str, np.ndarray]], setting
     }
     buffer = io.BytesIO()
     pq.write_table(pa.table(table), buffer, compression="zstd")
-    (folder / PAYLOAD).write_bytes(buffer.getbuffer())
+    (folder / stored.PAYLOAD).write_bytes(buffer.getbuffer())
     return keys.shape[1]

@@ -17,7 +17,6 @@ from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.worlds.settings import WorldSettings
 
 DEMOS = "name of the demonstrations"
-TARGET_DEMOS = f"{DEMOS}; empty: the ones that the target was trained on"
 QUICK = "a first policy in minutes: adds the settings in conf/quick.yaml"
 FIRST_EPISODES = "episodes used per task, lowest seeds first; 0: all"
 
@@ -115,7 +114,7 @@ class DemonstrationSettings(TaskSettings):
     groups: ClassVar = {"policy": "vision", "runtime": "cpu"}
 
     policy: PolicySettings = setting(PolicySettings, POLICY)
-    demos: str = setting("", TARGET_DEMOS)
+    demos: str = setting("", f"{DEMOS}; empty: the ones that the target was trained on")
 
 
 @dataclass

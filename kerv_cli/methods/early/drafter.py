@@ -250,6 +250,7 @@ class EarlyDrafter(TrainableDrafter):
 
     kind, noun = "early", "early drafter"
     settings: type[Any] = EarlySettings
+    drafts_with: type[EarlyProposer] = EarlyProposer
 
     def network(self, settings: Any, target: Any) -> nn.Module:
         """Return a network with initial weights, for the target's action space, chunk length and pooled prompt."""
@@ -257,8 +258,8 @@ class EarlyDrafter(TrainableDrafter):
 
     @classmethod
     def proposer(cls, settings: NoSettings, context: Context) -> EarlyProposer:
-        """Build the part that the setting `proposer=early` chooses."""
-        return EarlyProposer(context.artifact(cls.kind), context.target)
+        """Build the part that the setting `proposer=early` or `proposer=scout` chooses."""
+        return cls.drafts_with(context.artifact(cls.kind), context.target)
 
     def decoded(
         self, target: Any, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace, columns: dict[str, Tensor]
@@ -504,6 +505,7 @@ class ScoutDrafter(EarlyDrafter):
 
     kind = noun = "scout"
     settings = ScoutSettings
+    drafts_with = ScoutProposer
 
     def network(self, settings: ScoutSettings, target: Any) -> ScoutNetwork:
         """Return a network with initial weights, for the target's camera views.
@@ -513,11 +515,6 @@ class ScoutDrafter(EarlyDrafter):
         """
         height, width, _ = check_sees(target).frame_shape
         return ScoutNetwork(settings, target, width // height)
-
-    @classmethod
-    def proposer(cls, settings: NoSettings, context: Context) -> ScoutProposer:
-        """Build the part that the setting `proposer=scout` chooses."""
-        return ScoutProposer(context.artifact(cls.kind), context.target)
 
     def decoded(
         self, target: Any, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace, columns: dict[str, Tensor]

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
     from kerv_cli.engine.chunk import Chunk
     from kerv_cli.engine.draft import Draft
-    from kerv_cli.engine.protocol import ReadableTarget
     from kerv_cli.methods.context import Context
     from kerv_cli.methods.heisd.curvature import BoundaryRanges
     from kerv_cli.methods.heisd.datastore import Datastore, Neighbours
@@ -116,25 +115,14 @@ class RetrievalProposerSettings:
     any_code=True,
 )
 class RetrievalProposer(ChainProposer):
-    """Drafts the task's most similar stored chunks, merged into one tree (docs/methods.md §4.2).
-
-    Args:
-        datastore: The stored chunks.
-        target: The target, which encodes the observations.
-        neighbours: Number of stored chunks in the tree.
-        nodes: Maximum number of nodes of the tree.
-    """
+    """Drafts the task's most similar stored chunks, merged into one tree (docs/methods.md §4.2)."""
 
     name = "retrieval"
 
-    def __init__(self, datastore: Datastore, target: ReadableTarget, neighbours: int, nodes: int) -> None:
-        self.datastore, self.target, self.count, self.nodes = datastore, target, neighbours, nodes
+    def __init__(self, settings: RetrievalProposerSettings | HybridProposerSettings, context: Context) -> None:
+        self.datastore: Datastore = context.artifact("datastore")
+        self.target, self.count, self.nodes = context.target, settings.neighbours, settings.nodes
         self._nearest: tuple[Chunk, Neighbours] | None = None
-
-    @classmethod
-    def build(cls, settings: RetrievalProposerSettings | HybridProposerSettings, context: Context) -> RetrievalProposer:
-        """Build the part that proposer=retrieval chooses, or that proposer=hybrid contains."""
-        return cls(context.artifact("datastore"), context.target, settings.neighbours, settings.nodes)
 
     def neighbours(self, chunk: Chunk) -> Neighbours:
         """Return the stored entries most similar to the chunk's observation. The search runs once per chunk."""
@@ -198,7 +186,7 @@ class HybridProposer(Proposer):
     def build(cls, settings: HybridProposerSettings, context: Context) -> HybridProposer:
         """Build the hybrid proposer, which `proposer=hybrid` chooses."""
         drafter = registry.ProposerPart.find("drafter").built(settings, context)
-        return cls(drafter, RetrievalProposer.build(settings, context))
+        return cls(drafter, RetrievalProposer(settings, context))
 
     def begin(self, chunk: Chunk) -> None:
         """Select the proposer that the boundary chose for this chunk, and let it begin the chunk."""
@@ -459,7 +447,7 @@ class VerifySkip(Skip):
         proposer: Proposer | None = context.built["proposer"]
         retrieval = proposer.proposers["retrieval"] if isinstance(proposer, HybridProposer) else proposer
         if not isinstance(retrieval, RetrievalProposer):
-            retrieval = RetrievalProposer(context.artifact("datastore"), context.target, neighbours=1, nodes=1)
+            retrieval = RetrievalProposer(RetrievalProposerSettings(neighbours=1, nodes=1), context)
         if settings.s_min is not None:
             return cls(settings, retrieval, (settings.s_min,) * 3)
         manifest = retrieval.datastore.manifest

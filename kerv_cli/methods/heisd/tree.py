@@ -17,12 +17,7 @@ CROSS = 0.1  # assumed probability that a path of retrieved groups changes to an
 
 
 def neighbour_tree(
-    chunks: np.ndarray,
-    start: int,
-    space: ActionSpace,
-    nodes: int = 50,
-    depth: int | None = None,
-    cross: float = CROSS,
+    chunks: np.ndarray, start: int, space: ActionSpace, nodes: int = 50, depth: int | None = None, cross: float = CROSS
 ) -> Draft:
     """Merge the neighbours' chunks into one tree of kinematic groups (docs/methods.md §4.2).
 

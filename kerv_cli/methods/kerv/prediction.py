@@ -127,7 +127,12 @@ class Predictor:
         """
         self.held, self.dofs, self.noise = np.asarray(held, dtype=bool), len(held), noise
         self.minimum, self.window, self.horizon = minimum, window, horizon
-        self.tables = {m: self._table(m) for m in range(minimum, window + 1)}
+        self.tables = {}  # for each number of past actions the weights (D, horizon, past actions) of all DoFs
+        for past in range(minimum, window + 1):
+            table = np.tile(Predictor.weights(self, 0, past), (self.dofs, 1, 1))
+            for dof in np.flatnonzero(~self.held):
+                table[dof] = self.weights(int(dof), past)
+            self.tables[past] = table
 
     def weights(self, dof: int, window: int) -> np.ndarray:
         """Return the weights (horizon, window) for one DoF. This base class puts all weight on the newest action.
@@ -151,13 +156,6 @@ class Predictor:
                 "the calibration's filters were not fitted to strict DoFs: run 'kerv calibrate complete=true'"
             )
         return type(self)(np.zeros(self.dofs, bool), self.noise, self.minimum, self.window, self.horizon)
-
-    def _table(self, window: int) -> np.ndarray:
-        """Return the weights (D, horizon, window) of all DoFs, for this number of past actions."""
-        tables = np.tile(Predictor.weights(self, 0, window), (self.dofs, 1, 1))
-        for dof in np.flatnonzero(~self.held):
-            tables[dof] = self.weights(int(dof), window)
-        return tables
 
     def predict(self, history: np.ndarray, steps: int) -> np.ndarray | None:
         """Predict the next actions.
@@ -290,11 +288,7 @@ class PredictionProposer(ChainProposer):
 
 
 def assemble(
-    tokens: list[int],
-    chunk: Chunk,
-    predictor: Predictor,
-    settings: CompensateSettings,
-    drafted: Sequence[int] = (),
+    tokens: list[int], chunk: Chunk, predictor: Predictor, settings: CompensateSettings, drafted: Sequence[int] = ()
 ) -> np.ndarray | None:
     """Assemble the actions of a compensated chunk: known tokens, then drafted tokens, then predictions.
 
