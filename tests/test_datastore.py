@@ -22,8 +22,7 @@ from kerv_cli.base.errors import CheckpointError, StorageError, UnknownName, Usa
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.lab.database import Database
-from kerv_cli.methods.heisd.datastore import Datastore, Shard, check_seeds, prompt_key
-from kerv_cli.methods.heisd.tree import neighbour_tree
+from kerv_cli.methods.heisd.datastore import Datastore, Shard, check_seeds, neighbour_tree, prompt_key
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.checkpoint import TargetDescription, load_target
 from kerv_cli.training import datastore as datastore_build

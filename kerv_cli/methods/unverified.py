@@ -117,23 +117,16 @@ class StreakSkip(Skip):
         return SkipDecision(self.chain, self.source.name, TRUSTED)
 
     def verified(self, chunk: Chunk) -> None:
-        """Double the number of decodes allowed without verification if the verified draft agrees; else set it to 0."""
-        self.allowed = min(self.settings.most, 2 * self.allowed or 1) if self._agrees(chunk) else 0
-        self.left = self.allowed
+        """Double the number of decodes allowed without verification if the verified draft agrees; else set it to 0.
 
-    def _agrees(self, chunk: Chunk) -> bool:
-        """Return whether the draft was accepted whole, or differs from the target's tokens by at most `tolerance`.
-
-        The difference is the mean absolute difference, in normalised action units. Tokens of strict DoFs, such as the
-        gripper, must be equal. The result is False if the draft was not verified.
+        The draft agrees if it was accepted whole, or if its mean absolute difference from the target's tokens is at
+        most `tolerance`, in normalised action units. Tokens of strict DoFs, such as the gripper, must be equal.
         """
-        targets = chunk.targets_along(self.chain)
-        if targets is None:
-            return False
-        if chunk.rounds[-1].accepted == len(chunk.rounds[-1].drafted):
-            return True
-        tolerance = self.settings.tolerance
-        return tolerance > 0 and chunk.distance(self.chain[: len(targets)], targets) <= tolerance
+        targets, tolerance, agrees = chunk.targets_along(self.chain), self.settings.tolerance, False
+        if targets is not None:
+            whole = chunk.rounds[-1].accepted == len(chunk.rounds[-1].drafted)
+            agrees = whole or (tolerance > 0 and chunk.distance(self.chain[: len(targets)], targets) <= tolerance)
+        self.allowed = self.left = min(self.settings.most, 2 * self.allowed or 1) if agrees else 0
 
 
 @SkipPart("always", takes_draft=True, verifies=False, batchable=True, any_code=True)
@@ -210,10 +203,9 @@ class SpeedSkip(Skip):
         self.executed = len(path) - 1
         predicted = self.ridge.predict(chunk.situation.history.values(), chunk.steps)
         self.by_target = True
-        if predicted is None:
-            return SkipDecision()
-        speed = chunk.space.control_hz * math.dist(path[-1], path[-2])
-        if not s.v_min <= speed <= s.v_max or sum(self.decoded) <= s.share * s.buffer:
-            return SkipDecision()
-        self.by_target = False
-        return SkipDecision(chunk.space.bins_of(predicted).flatten().tolist(), self.ridge.name)
+        if predicted is not None and sum(self.decoded) > s.share * s.buffer:
+            speed = chunk.space.control_hz * math.dist(path[-1], path[-2])
+            if s.v_min <= speed <= s.v_max:
+                self.by_target = False
+                return SkipDecision(chunk.space.bins_of(predicted).flatten().tolist(), self.ridge.name)
+        return SkipDecision()

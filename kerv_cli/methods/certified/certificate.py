@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.manifests import read
 from kerv_cli.base.registry import part_of
@@ -138,11 +139,6 @@ class Certificate:
     earlier: list[Attempt] = field(default_factory=list)
 
     @property
-    def risk(self) -> float:
-        """Upper bound of the probability that this test, or any earlier test of this policy, certified falsely."""
-        return self.delta + sum(one.delta for one in self.earlier)
-
-    @property
     def is_tested(self) -> bool:
         """Whether the tests had enough episodes that AR solved to judge any of the candidates."""
         return any(one.p is not None for one in self.candidates)
@@ -215,10 +211,12 @@ class Certificate:
             )
         if chosen is None:
             return "nothing is certified: every draft is verified"
-        count = f"{len(self.tasks)} instruction{'s' * (len(self.tasks) != 1)}"
+        # upper bound of the probability that this test, or any earlier test of this policy, certified falsely
+        risk = self.delta + sum(one.delta for one in self.earlier)
+        instructions = count(len(self.tasks), "instruction")
         return (
-            f"{chosen.label}: not more than {self.margin:g} points below AR on these {count}, "
-            f"{100 * (1 - self.risk):g} % confidence, {chosen.pairs} pairs"
+            f"{chosen.label}: not more than {self.margin:g} points below AR on these {instructions}, "
+            f"{100 * (1 - risk):g} % confidence, {chosen.pairs} pairs"
             + (f"; the confidence is that of all {tests} tests of this policy" if tests > 1 else "")
         )
 

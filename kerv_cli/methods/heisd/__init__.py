@@ -138,7 +138,7 @@ class RetrievalProposer(ChainProposer):
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
         """Return the most similar stored chunks, as one tree of at most `depth` tokens per path."""
-        from kerv_cli.methods.heisd.tree import neighbour_tree
+        from kerv_cli.methods.heisd.datastore import neighbour_tree
 
         chunks = self.neighbours(chunk).chunks[:, : chunk.size]
         return neighbour_tree(chunks, len(chunk.tokens), chunk.space, self.nodes, depth)
