@@ -27,5 +27,5 @@ from __future__ import annotations
 
 # importing a family registers its parts; this is their order in error messages and help texts
 # isort: off
-from kerv_cli.methods import ar, spec_vla, eagle, early, kerv, unverified, heisd, reuse  # noqa: F401
+from kerv_cli.methods import ar, spec_vla, eagle, early, calibrated, kerv, unverified, heisd, reuse  # noqa: F401
 from kerv_cli.methods import merged, motion, certified  # noqa: F401

@@ -68,6 +68,7 @@ def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Beg
 
     stage = begin(drafter.kind, folder, f"{folder}: {plan}", train.steps)
     device, dtype = set_up(settings.runtime)
+    provenance = provenance_of("kerv train drafter", settings, device)
     with without_subnormals():
         with stage("the target's greedy decodes") as progress:
             target: Any = load_target(artifacts.folder, device, dtype)[0]
@@ -86,8 +87,8 @@ def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Beg
             return drafter.validate(network, target, held_out, settings)
 
         def save(network: Any, metrics: Metrics) -> None:
-            provenance = provenance_of("kerv train drafter", settings, device, **figures_of(dataset, network, metrics))
-            drafter.save(folder, network, MadeFor.of(description), provenance, train.stored, settings=shape)
+            made = provenance | figures_of(dataset, network, metrics)
+            drafter.save(folder, network, MadeFor.of(description), made, train.stored, settings=shape)
 
         with stage("training the drafter") as progress:
             return folder, fit(network, loss, validate, save, train, folder, identity, progress)

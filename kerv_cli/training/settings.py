@@ -175,8 +175,6 @@ class BuildDatastoreSettings(DemonstrationSettings):
     action tokens.
     """
 
-    groups: ClassVar = {"policy": "vision", "runtime": "cpu"}
-
     episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)
     half: bool = setting(False, "store keys in float16, half the size")
     components: int = number(0, 0, 65_536, help="project keys onto this many leading directions; 0: no projection")

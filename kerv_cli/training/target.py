@@ -105,6 +105,7 @@ def train_target(settings: TrainTargetSettings, database: Database, begin: Begin
 
     stage = begin("target", folder, f"{folder}: {plan}", train.steps)
     device, _ = set_up(settings.runtime)
+    provenance = provenance_of("kerv train target", settings, device) | origin
     with without_subnormals():
         with stage("reading demonstrations") as progress:
             target, samples = load_training(settings, dataset, tasks, init, world.camera.name, progress)
@@ -118,9 +119,8 @@ def train_target(settings: TrainTargetSettings, database: Database, begin: Begin
             return imitation.loss(draw(step), step)
 
         def save(target: CompactTarget, metrics: Metrics) -> None:
-            figures = figures_of(dataset, target, metrics)
-            provenance = provenance_of("kerv train target", settings, device, **figures) | origin
-            save_target(folder, target, dataset.manifest.environment, provenance, train.stored, states())
+            made = provenance | figures_of(dataset, target, metrics)
+            save_target(folder, target, dataset.manifest.environment, made, train.stored, states())
 
         with stage("training the target") as progress:
             return folder, fit(target, loss, imitation.validate, save, train, folder, identity, progress)

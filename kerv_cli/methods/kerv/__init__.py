@@ -1,7 +1,4 @@
-"""KERV (docs/methods.md §3): after a rejection, predict actions from the motion; adapt the threshold to the motion.
-
-The calibration, whose numbers KERV and HeiSD read, is registered here, too.
-"""
+"""KERV (docs/methods.md §3): after a rejection, predict actions from the motion; adapt the threshold to the motion."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, choice, number
-from kerv_cli.base.registry import PREFILL, ArtifactPart, NoSettings, ProposerPart, RectifierPart, ThresholdPart
+from kerv_cli.base.registry import PREFILL, NoSettings, ProposerPart, RectifierPart, ThresholdPart
 from kerv_cli.engine.decisions import Rectified
 from kerv_cli.engine.parts import Rectifier, Threshold
 
@@ -20,15 +17,6 @@ if TYPE_CHECKING:
     from kerv_cli.engine.record import Measure
     from kerv_cli.methods.context import Context
     from kerv_cli.methods.kerv.prediction import Predictor
-
-
-# the calibration has a section for a drafter and one for a datastore
-@ArtifactPart("calibration", needs=("drafter", "datastore"), by_task=True, needs_task=True)
-def artifact() -> type:
-    """Import and return the class that makes and loads calibrations."""
-    from kerv_cli.methods.calibration import CalibrationArtifact
-
-    return CalibrationArtifact
 
 
 # --- predictors, and proposers that draft with them (§3.1, §6)
