@@ -109,45 +109,27 @@ class PublicDrafter(DraftNetwork):
         self.fc = nn.Linear(2 * language.hidden_size, language.hidden_size, bias=shape.bias)
         self.layers = nn.ModuleList(LlamaLayer(language, normed=i > 0) for i in range(language.num_hidden_layers))
 
-    def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> DraftCache:
-        """Return an empty cache.
-
-        Args:
-            batch: Number of sequences.
-            capacity: Maximum number of tokens.
-            fixed: Whether the cache's tensors always have full size, as CUDA graphs need. None: only on CUDA.
-        """
-        weight, sizes = self.fc.weight, self.shape.language.cache_sizes(batch, capacity)
-        return DraftCache(*sizes, weight, weight.is_cuda if fixed is None else fixed)
+    def new_cache(self, batch: int, capacity: int) -> DraftCache:
+        """Return an empty cache for at most `capacity` tokens of each of `batch` sequences."""
+        weight = self.fc.weight
+        return DraftCache(*self.shape.language.cache_sizes(batch, capacity), weight, weight.is_cuda)
 
     def run(self, inputs: Sequence[Tensor], positions: Tensor, cache: Any, seen: np.ndarray | Tensor | None) -> Tensor:
-        """Compute what `forward` returns. `inputs` are its first two arguments."""
+        """Compute what `forward` returns. `inputs` are its first two arguments.
+
+        With `mask=prompt`, a query sees a key only if the key is one of the prompt's first P − 1 tokens and `seen`
+        allows it.
+        """
         if cache is not None and not cache.length:
             cache.prompt = inputs[0].shape[1]
-        x = self.fc(torch.cat([*inputs], -1))
-        mask = self.prompt_mask(x, cache, seen) if self.shape.convention.mask == "prompt" else None
+        x, mask = self.fc(torch.cat([*inputs], -1)), None
+        if self.shape.convention.mask == "prompt":
+            size = x.shape[1]
+            mask = attention_mask(np.tri(size, dtype=bool) if seen is None else seen, size, cache, x)
+            if mask is None:
+                mask = x.new_zeros(size, cache.length + size)
+            mask[:, max(1, (cache.prompt if cache is not None else size) - 1) :] = -torch.inf
         return run_layers(self.layers, self.shape.language, x, positions, cache, seen, mask)
-
-    def prompt_mask(self, x: Tensor, cache: DraftCache | None, seen: np.ndarray | Tensor | None) -> Tensor:
-        """Return the additive attention mask for `mask=prompt`.
-
-        A query sees a key only if the key is one of the prompt's first P − 1 tokens and `seen` allows it.
-
-        Args:
-            x: (B, T, E) inputs of the layers.
-            cache: Keys and values of S earlier tokens. None: there are none, and x is the prompt.
-            seen: (T, M) bool, which of the last M keys each query may see. None: all keys up to its own position.
-
-        Returns:
-            (T, S + T): 0 for visible keys, −∞ for hidden keys.
-        """
-        prompt = cache.prompt if cache is not None else x.shape[1]
-        mask = attention_mask(np.tri(x.shape[1], dtype=bool) if seen is None else seen, x.shape[1], cache, x)
-        if mask is None:
-            assert cache is not None
-            mask = x.new_zeros(x.shape[1], cache.length + x.shape[1])
-        mask[:, max(1, prompt - 1) :] = -torch.inf
-        return mask
 
 
 def read_public(folder: Path, target: ReadableTarget, convention: Convention) -> PublicDrafter:
