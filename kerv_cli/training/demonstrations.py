@@ -67,13 +67,17 @@ def open_demos(database: Database, names: str, tasks: Sequence[str] = (), episod
     opened = []
     for name in parts:
         folder = artifact_or_path(results, "demos", name)
-        if not (folder / "manifest.json").exists() and (command := command_to_go_on(database, "demos", folder)):
-            line = shlex.join(["kerv", *command])
-            raise CheckpointError(f"the demonstrations in {folder} are unfinished: run '{line}'")
-        if not folder.is_dir():
+        try:
+            opened.append(DemoDataset.open(folder))
+        except CheckpointError as error:
+            command = command_to_go_on(database, "demos", folder)
+            if command and not (folder / "manifest.json").exists():
+                line = shlex.join(["kerv", *command])
+                raise CheckpointError(f"the demonstrations in {folder} are unfinished: run '{line}'") from error
+            if folder.is_dir():
+                raise
             remedy = _remedy(database.results / "artifacts/demos", folder, tasks, episodes)
-            raise CheckpointError(f"no demonstrations in {folder}: {remedy}")
-        opened.append(DemoDataset.open(folder))
+            raise CheckpointError(f"no demonstrations in {folder}: {remedy}") from error
     return DemoDataset.joined(opened)
 
 
