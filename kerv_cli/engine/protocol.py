@@ -14,6 +14,10 @@ from torch import Tensor, nn
 
 from kerv_cli.base.spaces import ActionSpace, Observation
 
+Seen = np.ndarray | Tensor | None
+"""Attention mask (T, M) bool: which of the last M tokens, old or new, each of T new tokens attends to. None: attention
+is causal. A target on a GPU may get a tensor instead of an array."""
+
 
 class Cache(Protocol):
     """Keys and values of the tokens that the target has processed, one token per slot.
@@ -80,9 +84,7 @@ class Target(Protocol):
             capacity: Number of tokens that fit into each sequence.
         """
 
-    def forward(
-        self, x: Tensor, positions: Tensor, cache: Any = None, seen: np.ndarray | Tensor | None = None
-    ) -> Tensor:
+    def forward(self, x: Tensor, positions: Tensor, cache: Any = None, seen: Seen = None) -> Tensor:
         """Process T new tokens that follow the cached ones, and return their hidden states (B, T, E).
 
         Args:
@@ -90,8 +92,7 @@ class Target(Protocol):
             positions: Position of each new token in the sequence (T,), for the positional encoding.
             cache: From `new_cache`. The new tokens attend to all cached tokens and are added to the cache. None: there
                 are no earlier tokens.
-            seen: Attention mask (T, T) bool: whether new token i attends to new token j. None: attention is causal. A
-                target on a GPU may get a tensor instead of an array.
+            seen: Attention mask (T, T) bool: whether new token i attends to new token j. None: attention is causal.
         """
 
     def head(self, hidden: Tensor) -> Tensor:
@@ -128,9 +129,7 @@ class ContinuesGreedily(Protocol):
 class PredictsTokens(Protocol):
     """A target that predicts the next tokens in one call, faster than with `embed`, `forward` and `head`."""
 
-    def predict(
-        self, tokens: Tensor, positions: Tensor, cache: Any, seen: np.ndarray | Tensor | None
-    ) -> tuple[Tensor, Tensor]:
+    def predict(self, tokens: Tensor, positions: Tensor, cache: Any, seen: Seen) -> tuple[Tensor, Tensor]:
         """Process T new tokens that follow the cached ones.
 
         Args:

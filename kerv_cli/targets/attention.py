@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from kerv_cli.engine.protocol import Seen
 from kerv_cli.engine.transfer import upload
 
 
@@ -119,7 +120,7 @@ def attend(q: Tensor, k: Tensor, v: Tensor, cache: Tensor | None, slots: Slots |
     return attended.transpose(1, 2).flatten(2)
 
 
-def attention_mask(seen: np.ndarray | Tensor | None, tokens: int, cache: Cache | None, like: Tensor) -> Tensor | None:
+def attention_mask(seen: Seen, tokens: int, cache: Cache | None, like: Tensor) -> Tensor | None:
     """Return the additive attention mask of new tokens: 0 for visible tokens, -inf for hidden tokens.
 
     Args:

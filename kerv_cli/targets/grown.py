@@ -26,9 +26,9 @@ from kerv_cli.base.manifests import read
 from kerv_cli.base.paths import artifact, find_target
 from kerv_cli.targets import checkpoint
 from kerv_cli.targets.checkpoint import TargetDescription
-from kerv_cli.targets.compact.compilable import compile_parts
-from kerv_cli.targets.compact.folder import build as build_compact
+from kerv_cli.targets.compact.program import compile_parts
 from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.compact.target import build as build_compact
 from kerv_cli.targets.compact.trunk import Layer, LayerStack, Rotary
 from kerv_cli.targets.settings import BuildTargetSettings, GrowSettings
 

@@ -24,12 +24,11 @@ from kerv_cli.base.codes import FastCode
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ActionSpace, Place
 from kerv_cli.targets.checkpoint import TargetDescription
-from kerv_cli.targets.compact.features import places_of
-from kerv_cli.targets.compact.settings import TargetSettings
+from kerv_cli.targets.compact.features import WordTokenizer, places_of
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.losses import labels_of, position_loss, token_loss
 from kerv_cli.targets.observations import Observations, read_chunks, read_observations, split
+from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.training.fit import Metrics
 from kerv_cli.training.settings import TrainSettings
 from kerv_cli.worlds import specs

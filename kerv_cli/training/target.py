@@ -19,8 +19,7 @@ from kerv_cli.base.runtime import set_up
 from kerv_cli.episodes.runner import success_of
 from kerv_cli.lab.database import Database
 from kerv_cli.targets.checkpoint import load_target, read_target
-from kerv_cli.targets.compact.folder import save_target
-from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.compact.target import CompactTarget, save_target
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_spaces, check_tasks, name_of, open_demos, seen_by
 from kerv_cli.training.fit import Metrics, batches, figures_of, fit, identity_of, refuse_other, without_subnormals

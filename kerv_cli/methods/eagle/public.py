@@ -23,7 +23,7 @@ from kerv_cli.targets.attention import Cache, attention_mask
 from kerv_cli.targets.checkpoint import WEIGHTS, load_tensors
 from kerv_cli.targets.openvla.config import CONFIG, Language
 from kerv_cli.targets.openvla.loading import SINGLE, Sizes, check_layout, open_shards, sizes_of
-from kerv_cli.targets.openvla.trunk import LlamaLayer, run_layers
+from kerv_cli.targets.openvla.network import LlamaLayer, run_layers
 
 EMBEDDING = "embed_tokens.weight"
 

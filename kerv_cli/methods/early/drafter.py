@@ -28,8 +28,7 @@ from kerv_cli.engine.transfer import read
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.drafters import Decodes, Metrics, TrainableDrafter
 from kerv_cli.methods.early import EarlySettings
-from kerv_cli.targets.compact.compilable import FORMATS, Compilable
-from kerv_cli.targets.compact.program import Program
+from kerv_cli.targets.compact.program import Compilable, Program
 from kerv_cli.targets.losses import labels_of, token_loss, within_chunk
 from kerv_cli.targets.observations import observations_of, prompts_of
 from kerv_cli.worlds.demos.files import DemoEpisode
@@ -79,9 +78,9 @@ class EarlyNetwork(Compilable):
         self.spread = nn.Linear(settings.width, self.tokens * settings.rank)
         self.head = nn.Linear(settings.rank, actions.tokens)
 
-    def new_program(self) -> Program | None:
-        """Return the compiled network. None if there are no compiled kernels for the weights' number format."""
-        return Program(self.logits, (1, len(self.mean))) if self.mean.dtype in FORMATS else None
+    def new_program(self) -> Program:
+        """Return the compiled network."""
+        return Program(self.logits, (1, len(self.mean)))
 
     def standardise(self, features: Tensor) -> None:
         """Set the mean and the scale by which inputs are standardised, from the training features (n, F)."""

@@ -26,13 +26,12 @@ from kerv_cli.methods.context import Context
 from kerv_cli.methods.drafters import Decodes, Metrics
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyNetwork, EarlyProposer
 from kerv_cli.methods.scout import ScoutSettings
-from kerv_cli.targets.compact.compilable import FORMATS, Compilable, wants_gradient
 from kerv_cli.targets.compact.features import hand_features, mlp, scene_features, scene_width
-from kerv_cli.targets.compact.program import Program
-from kerv_cli.targets.compact.target import Inputs
+from kerv_cli.targets.compact.program import Compilable, Program
+from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.compact.vision import VisionEncoder
 from kerv_cli.targets.losses import position_loss
-from kerv_cli.targets.observations import BATCH, LocatesPlaces, Observations, read_observations
+from kerv_cli.targets.observations import BATCH, Observations, read_observations
 from kerv_cli.worlds.demos.files import DemoEpisode
 
 
@@ -83,7 +82,7 @@ class ScoutNetwork(Compilable):
     def forward(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
         """Return the logits (B, N, V), and the estimated positions of object and goal (B, K, 3), in metres."""
         given = self.views(inputs)
-        if self.compiled is not None and not any(map(wants_gradient, given)):
+        if self.compiled is not None and self.runs_compiled(*given):
             logits, places = self.compiled(*given)
             return logits, places
         return self.network(*given)
@@ -125,12 +124,9 @@ class ScoutNetwork(Compilable):
         features, places = self.see(*given)
         return self.drafter.logits(features.to(self.drafter.head.weight.dtype)), places
 
-    def new_program(self) -> Program | None:
-        """Return the compiled network, without its vision encoders.
-
-        Return None if there are no compiled kernels for the weights' number format.
-        """
-        return Program(self.network, *self.shapes) if self.cells.weight.dtype in FORMATS else None
+    def new_program(self) -> Program:
+        """Return the compiled network, without its vision encoders."""
+        return Program(self.network, *self.shapes)
 
     @property
     def shapes(self) -> list[tuple[int, ...]]:
@@ -259,13 +255,13 @@ class ScoutDrafter(EarlyDrafter):
         return {f"{name}_error_cm": 100 * float(e) for name, e in zip(names, error, strict=True)}
 
 
-def check_sees(target: Any) -> LocatesPlaces:
+def check_sees(target: Any) -> CompactTarget:
     """Return the target, if it has a camera and estimates positions.
 
     Raises:
         CheckpointError: The target has no camera, or estimates no positions.
     """
-    if not isinstance(target, LocatesPlaces) or not getattr(target, "cameras", ()):
+    if not isinstance(target, CompactTarget) or not getattr(target, "cameras", ()):
         raise CheckpointError(
             "a scout needs a target with a camera that locates object and goal (policy=vision); this one has none"
         )

@@ -1,4 +1,4 @@
-"""Features of the scene and of the privileged state, scaled to about 1 (docs/methods.md §0.1).
+"""Features of the scene and of the privileged state, scaled to about 1 (docs/methods.md §0.1), and ids of words.
 
 A place is a position that the task is about: of the object or of the goal, for example. The privileged state is what
 only the simulator knows.
@@ -9,13 +9,18 @@ Shapes: B batch, p numbers of proprioception, K places, s numbers of privileged 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor, nn
 
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ObservationSpace, Place
 
 COARSE, FINE = 0.1, 0.02  # metres: a vector is divided by COARSE, and before a tanh by FINE
+PAD, UNKNOWN = 0, 1  # ids of words
 STEP = 0.01  # metres (or units of the state) per control step: velocities are divided by it
 
 
@@ -102,3 +107,43 @@ def position(states: Tensor, place: Place) -> Tensor:
 def places_of(states: Tensor, space: ObservationSpace) -> Tensor:
     """Return the 3D positions (B, K, 3) of `space.places`, such as object and goal, in metres, from states (B, s)."""
     return torch.stack([position(states, place) for place in space.places], 1)
+
+
+@dataclass(frozen=True)
+class WordTokenizer:
+    """A fixed vocabulary of whole words, which turns an instruction into one id per word, padded to a fixed length.
+
+    The vocabulary is stored in the checkpoint. It is built from all instructions of the environment, so a policy
+    trained on ten tasks can be fine-tuned on fifty without a new embedding.
+
+    Attributes:
+        words: The known words. `words[i]` has id i + 2. Id 0 is padding, id 1 stands for any unknown word.
+    """
+
+    words: tuple[str, ...]
+
+    @classmethod
+    def build(cls, sentences: Iterable[str]) -> WordTokenizer:
+        """Return a tokenizer for all lower-case words of the sentences, in alphabetical order."""
+        return cls(tuple(sorted({word for s in sentences for word in s.lower().split()})))
+
+    @property
+    def size(self) -> int:
+        """Number of ids: one per word, one for padding, and one for unknown words."""
+        return len(self.words) + 2
+
+    @cached_property
+    def index(self) -> dict[str, int]:
+        """Map from a word to its id."""
+        return {word: i + 2 for i, word in enumerate(self.words)}
+
+    def encode(self, sentence: str, length: int) -> list[int]:
+        """Return exactly `length` ids for a sentence, with padding at the end.
+
+        Raises:
+            UsageError: The sentence has more than `length` words. It is not cut, because a decisive word could be lost.
+        """
+        ids = [self.index.get(word, UNKNOWN) for word in sentence.lower().split()]
+        if len(ids) > length:
+            raise UsageError(f"instruction '{sentence}' has {len(ids)} words, the policy takes {length}: shorten it")
+        return ids + [PAD] * (length - len(ids))

@@ -26,7 +26,7 @@ LINEAR, NORM, SILU, TANH, ADD, MULTIPLY, AFFINE, CLAMP, GATHER, EMBED, ARGMAX, A
 """Codes of the operations."""
 HALF, INT8, FLOAT, BFLOAT, BLOCKED = range(5)
 """Number formats in which the weights of a matrix can be stored: float16, int8 with a scale per output, float32,
-bfloat16, and bfloat16 in oneDNN's layout (see `bfloat16.py`)."""
+bfloat16, and bfloat16 in oneDNN's layout (`program.Blocked`)."""
 PANEL = 64
 """Number of outputs in a panel. A matrix is stored panel by panel."""
 COLUMNS = ["code", "out", "a", "b", "rows", "width", "stride", "first", "step", "weights", "factors", "panels", "kind"]
@@ -61,6 +61,11 @@ class Recorded:
 
     def __init__(self, tape: Tape, place: Tensor) -> None:
         self.tape, self.place, self.shape = tape, place, place.shape
+
+    @property
+    def first(self) -> int:
+        """Place of the first element."""
+        return int(self.place.flatten()[0])
 
     @classmethod
     def __torch_function__(cls, function: Any, _: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -206,11 +211,14 @@ class Tape:
             The result.
         """
         out = out if isinstance(out, Recorded) else self.register(*out)
-        lined = [self.lined(x, x.place.numel() if i else width) for i, x in enumerate(inputs)]
-        first = [int(x.place.flatten()[0]) for x in (out, *(x for x, _, _ in lined))]
-        shape = {"rows": lined[0][1], "width": width, "stride": lined[0][2], "first": self.placed(numbers)}
-        places = dict(zip(("out", "a", "b"), first, strict=False))
-        self.ops.append({"code": code, "reads": [x.place for x, _, _ in lined], **shape, **places, **columns})
+        x, rows, stride = self.lined(inputs[0], width)
+        op = {"code": code, "out": out.first, "a": x.first, "rows": rows, "width": width, "stride": stride}
+        reads = [x.place]
+        for x in inputs[1:]:
+            second, _, _ = self.lined(x, x.place.numel())
+            op["b"] = second.first
+            reads.append(second.place)
+        self.ops.append({**op, "first": self.placed(numbers), "reads": reads, **columns})
         return out
 
     def lined(self, x: Recorded, width: int) -> tuple[Recorded, int, int]:
@@ -232,8 +240,8 @@ class Tape:
     def copied(self, x: Recorded, out: Recorded) -> Recorded:
         """Append an operation that copies the elements of `x`, in order, into the register of `out`. Return `out`."""
         places = x.place.flatten().tolist()
-        op = {"code": GATHER, "rows": 1, "width": len(places), "first": len(self.indices), "reads": [x.place]}
-        self.ops.append(op | {"out": int(out.place.flatten()[0])})
+        op = {"code": GATHER, "out": out.first, "rows": 1, "width": len(places), "first": len(self.indices)}
+        self.ops.append({**op, "reads": [x.place]})
         self.indices += places
         return out
 
@@ -277,8 +285,10 @@ class Tape:
 
         life = {int(r): [0, len(self.ops)] for x in kept for r in np.unique(register_of(x.place))}
         for i, op in enumerate(self.ops):
-            for r in np.unique(np.concatenate([register_of(x).ravel() for x in (op["out"], *op["reads"])])):
-                life.setdefault(int(r), [i, i])[1] = max(i, life.get(int(r), [0, 0])[1])
+            used = [register_of(places).ravel() for places in (op["out"], *op["reads"])]
+            for r in np.unique(np.concatenate(used)).tolist():
+                life.setdefault(r, [i, i])
+                life[r][1] = max(i, life[r][1])
         place, done = np.zeros(len(begins), np.int64), list[int]()
         for r, (born, last) in sorted(life.items(), key=lambda item: item[1][0]):
             for other in sorted(done, key=place.__getitem__):

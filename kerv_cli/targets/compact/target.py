@@ -17,7 +17,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,11 +26,14 @@ import torch
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
+from kerv_cli.engine.protocol import Seen
 from kerv_cli.engine.transfer import upload
 from kerv_cli.targets.attention import Cache, attention_mask
-from kerv_cli.targets.compact.compilable import FORMATS, Compilable, CompilableLinear, wants_gradient
+from kerv_cli.targets.checkpoint import FLOAT32, TargetDescription, save_module, target_fields
 from kerv_cli.targets.compact.features import (
+    WordTokenizer,
     hand_features,
     mlp,
     places_of,
@@ -38,11 +42,10 @@ from kerv_cli.targets.compact.features import (
     scene_features,
     scene_width,
 )
-from kerv_cli.targets.compact.program import Program
-from kerv_cli.targets.compact.settings import TargetSettings
-from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.targets.compact.program import Compilable, CompilableLinear, Program, load_compiled
 from kerv_cli.targets.compact.trunk import Trunk
 from kerv_cli.targets.compact.vision import VisionEncoder
+from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.worlds.views import frame_shape, views_of
 
 
@@ -64,7 +67,7 @@ class Inputs:
 
 
 class Programs(NamedTuple):
-    """The compiled programs of a target. A copied or pickled target holds None instead of them.
+    """The compiled programs of a target.
 
     Attributes:
         prompt: Program that encodes a prompt.
@@ -74,9 +77,6 @@ class Programs(NamedTuple):
 
     prompt: Program
     step: Program
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(None), ()
 
 
 class CompactTarget(Compilable):
@@ -255,7 +255,7 @@ class CompactTarget(Compilable):
             images = inputs.images.split(self.settings.image_size, -1)
             views = [encoder(image) for encoder, image in zip(self.encoders, images, strict=True)]
             given[2:] = torch.cat([tokens for tokens, _ in views], 1), torch.cat([points for _, points in views], -1)
-        if self.compiled is not None and not any(map(wants_gradient, given)):
+        if self.compiled is not None and self.runs_compiled(*given):
             prompt, places = self.compiled.prompt(*given)
             return prompt.to(self.dtype), places
         return self.prompt(*given)
@@ -299,13 +299,8 @@ class CompactTarget(Compilable):
             located = self.locate(features)
         return located.to(torch.float32).unflatten(-1, (-1, 3)) * 0.1 + self.centre
 
-    def new_program(self) -> Programs | None:
-        """Return compiled programs that encode a prompt and decode tokens.
-
-        None if no compiled kernels exist for the weights' number format.
-        """
-        if self.dtype not in FORMATS:
-            return None
+    def new_program(self) -> Programs:
+        """Return compiled programs that encode a prompt and decode tokens."""
         s, space = self.settings, self.observation
         shapes: list[tuple[int, ...]] = [(1, s.instruction_tokens), (1, len(space.proprioception))]
         if self.cameras:
@@ -356,10 +351,8 @@ class CompactTarget(Compilable):
         """
         return self.trunk.new_cache(batch, capacity, fixed)
 
-    def forward(
-        self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
-    ) -> Tensor:
-        """Return the hidden states (B, T, E) of embeddings x (B, T, E). `Trunk.forward` explains the arguments."""
+    def forward(self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: Seen = None) -> Tensor:
+        """Return the hidden states (B, T, E) of embeddings x (B, T, E). `Target.forward` explains the arguments."""
         return self.trunk(x, positions, cache, seen)
 
     def continue_greedily(self, token: int, count: int, cache: Cache, end: int | None = None) -> list[int] | None:
@@ -380,20 +373,8 @@ class CompactTarget(Compilable):
         cache.length += len(tokens)
         return [int(token) for token in tokens[:, 0]]
 
-    def predict(
-        self, tokens: Tensor, positions: Tensor, cache: Cache, seen: np.ndarray | Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """Read T new tokens. A compiled target does this in one call.
-
-        Args:
-            tokens: The new tokens (T,) int64.
-            positions: (T,) rotary positions of the new tokens.
-            cache: Keys and values of earlier tokens. This forward appends the new ones.
-            seen: (T, M) bool, which of the last M tokens, old or new, each new token attends to. None: causal mask.
-
-        Returns:
-            The most probable token after each new token, (T,) int64, and the hidden states (1, T, E) of the new tokens.
-        """
+    def predict(self, tokens: Tensor, positions: Tensor, cache: Cache, seen: Seen) -> tuple[Tensor, Tensor]:
+        """Read T new tokens, if compiled in one call. `PredictsTokens.predict` explains arguments and results."""
         if self.compiled is None or cache.fixed:
             hidden = self(self.embed(tokens[None]), positions, cache, seen)
             return self.head(hidden[0]).argmax(-1), hidden
@@ -452,3 +433,50 @@ def _smooth_table(tokens: int, width: int) -> Tensor:
     frequency = torch.exp(torch.rand(width, generator=generator) * 4.0)  # up to 55 rad per unit
     phase = torch.rand(width, generator=generator) * 2 * torch.pi
     return 0.03 * torch.cos(centres * frequency + phase)
+
+
+def save_target(
+    folder: Path,
+    target: CompactTarget,
+    environment: str,
+    provenance: dict[str, Any],
+    stored: str = FLOAT32,
+    state_range: Sequence[Sequence[float]] | None = None,
+) -> str:
+    """Write a target's weights and `target.json`. Return the SHA-256 of the weights.
+
+    Args:
+        folder: Folder to write to.
+        target: The target.
+        environment: Name of the environment that the target's demonstrations come from.
+        provenance: How the target was made, see `provenance_of`.
+        stored: Number format of the stored weights: float32, float16 or int8.
+        state_range: The 0.1th percentile of each number of the demonstrations' states, then the 99.9th percentile of
+            each. None: not recorded.
+    """
+    others: dict[str, Any] = {"cameras": target.cameras, "words": target.words.words, "provenance": provenance}
+    if state_range:
+        others["state_range"] = state_range
+    spaces = target.actions, target.observation
+    fields = target_fields("compact", asdict(target.settings), environment, *spaces, **others)
+    return save_module(folder, "target", target, fields, stored)
+
+
+def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> CompactTarget:
+    """Load a compact target for inference. The target is frozen and, on a CPU, compiled.
+
+    Args:
+        folder: Folder with the weights.
+        description: The content of its `target.json`.
+        device: Device to load it to.
+        dtype: Number format to convert the weights to.
+
+    Raises:
+        CheckpointError: The description does not belong to a compact target, or the weights do not fit it.
+    """
+    settings = read(TargetSettings, description.settings, str(folder / "target.json"))
+    camera = description.cameras[0] if description.cameras else ""
+    words = WordTokenizer(description.words)
+    target = CompactTarget(settings, description.actions, description.observation, words, camera)
+    target.sha256 = description.sha256
+    return load_compiled(target, folder, "target", device, dtype)

@@ -17,7 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.targets.compact.compilable import Compilable
+from kerv_cli.targets.compact.program import Compilable
 
 
 class Residual(nn.Module):
@@ -111,8 +111,7 @@ class PackedVision:
     smallest drafter has eleven convolutions. Measured on an AMD EPYC, 96 × 96 pixels, 8 channels: 607 µs in torch,
     270 µs here.
 
-    A copied or pickled encoder holds None instead of this object, because an ONNX session cannot be copied. The session
-    uses as many threads as torch has at the time of the export.
+    The session uses as many threads as torch has at the time of the export.
     """
 
     def __init__(self, encoder: nn.Module, size: int) -> None:
@@ -134,9 +133,6 @@ class PackedVision:
         options.log_severity_level = 3
         providers = ["CPUExecutionProvider"]
         self.session = onnxruntime.InferenceSession(exported.getvalue(), options, providers=providers)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(None), ()
 
     def __call__(self, images: Tensor) -> list[Tensor]:
         """Map an image (1, 3, size, size) uint8 to vision tokens (1, grid², E) and K image points (1, 2K)."""

@@ -22,8 +22,7 @@ from torch import Tensor, nn
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import regular, sha256_of, visible
 from kerv_cli.targets.openvla.config import CONFIG, Shape
-from kerv_cli.targets.openvla.trunk import LanguageModel, quantise
-from kerv_cli.targets.openvla.vision import VisionBackbone, projector
+from kerv_cli.targets.openvla.network import OpenVLAModel, quantise
 
 Sizes = tuple[int, ...]
 SINGLE = "model.safetensors"
@@ -122,16 +121,6 @@ def check_layout(shapes: Mapping[str, Sizes], expected: Mapping[str, Sizes], whe
             wrong.append(f"{len(names)} {kind}: {listed}")
     if wrong:
         raise CheckpointError(f"the weights in {where} are not those of its {CONFIG}: {'; '.join(wrong)}")
-
-
-class OpenVLAModel(nn.Module):
-    """All modules of an OpenVLA. They have the names that published checkpoints use."""
-
-    def __init__(self, shape: Shape) -> None:
-        super().__init__()
-        self.vision_backbone = VisionBackbone(shape)
-        self.projector = projector(shape)
-        self.language_model = LanguageModel(shape.language)
 
 
 def layout(shape: Shape) -> dict[str, Sizes]:

@@ -17,7 +17,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -28,6 +27,7 @@ from kerv_cli.base.manifests import read
 from kerv_cli.base.paths import artifact
 from kerv_cli.base.runtime import DTYPES, set_up
 from kerv_cli.base.spaces import Observation, ObservationSpace
+from kerv_cli.engine.protocol import Seen
 from kerv_cli.engine.transfer import upload
 from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.checkpoint import FORMAT, TargetDescription, load_target, target_fields
@@ -148,17 +148,8 @@ class OpenVLATarget:
         fixed = self.action_rows.is_cuda if fixed is None else fixed
         return Cache(*self.shape.language.cache_sizes(batch, capacity), self.action_rows, fixed)
 
-    def forward(
-        self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
-    ) -> Tensor:
-        """Run all layers over T new tokens, and return their hidden states (B, T, E).
-
-        Args:
-            x: (B, T, E) embeddings of the new tokens.
-            positions: (T,) rotary positions of the new tokens.
-            cache: Keys and values of earlier tokens. This forward appends the new ones. None: no earlier tokens.
-            seen: (T, M) bool, which of the last M tokens, old or new, each new token attends to. None: causal mask.
-        """
+    def forward(self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: Seen = None) -> Tensor:
+        """Return the hidden states (B, T, E) of embeddings x (B, T, E). `Target.forward` explains the arguments."""
         return self.model.language_model.model(x, positions, cache, seen)
 
     def head(self, hidden: Tensor) -> Tensor:
