@@ -35,19 +35,6 @@ class Accepted(NamedTuple):
     rejected: int | None
 
 
-def accept_by_distance(tree: TokenTree, target_tokens: Sequence[int], start: int, limits: Sequence[int]) -> Accepted:
-    """Return the longest path on which every token is close enough to the target token.
-
-    Args:
-        tree: The draft, n nodes.
-        target_tokens: The target's prediction after the last committed token, then after each of the n nodes.
-        start: Number of committed tokens. A node at depth d is token start + d of the chunk.
-        limits: Largest accepted distance per DoF, in bins. With all zeros, tokens must be equal.
-    """
-    alone = [(dof, dof + 1) for dof in range(len(limits))]  # every DoF is a group of its own
-    return accept_by_group(tree, target_tokens, start, limits, group_limit=max(limits), bounds=alone)
-
-
 def accept_by_group(
     tree: TokenTree,
     target_tokens: Sequence[int],
@@ -143,7 +130,9 @@ class DistanceRule(Buildable):
             start: Number of committed tokens. A node at depth d is token start + d of the chunk.
             r: Acceptance radius, in bins.
         """
-        return accept_by_distance(tree, target_tokens, start, self.limits(r))
+        limits = self.limits(r)
+        alone = [(dof, dof + 1) for dof in range(len(limits))]  # every DoF is a group of its own
+        return accept_by_group(tree, target_tokens, start, limits, group_limit=max(limits), bounds=alone)
 
     def judge_after(self, tokens: Sequence[int], tree: TokenTree, target_tokens: Sequence[int], r: int) -> Accepted:
         """Return what `judge` returns. A rule that also reads the committed `tokens` overrides this."""

@@ -109,7 +109,7 @@ class OpenPi(Conversation):
         else:
             for step, action in enumerate(executed, 1):
                 self.decoder.observe(action, self.last_hand + (hand - self.last_hand) * step / len(executed))
-        self.policy.range.check(observation)
+        self.policy.check_range(observation)
         record = self.policy.decode(self.decoder, observation)
         self.last, self.last_hand = record.actions, hand
         self.decodes += 1

@@ -171,7 +171,7 @@ class VlaEval(Conversation):
         elif step == len(episode.path):
             self.decoder.observe(episode.sent[-1], hand)
         episode.path[step:] = [hand]  # replace the position that a failed observation of this step left
-        self.policy.range.check(state)
+        self.policy.check_range(state)
         if not episode.left:
             record = self.policy.decode(self.decoder, self._observation(episode, payload, numbers))
             episode.decodes.append(record)

@@ -128,7 +128,7 @@ def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarr
         CheckpointError: Too few actions were recorded after the success.
     """
     check_tail(episode, chunk, f"chunks of {chunk}")
-    return np.stack([episode.labels[t : t + chunk] for t in steps])
+    return episode.labels[steps[:, None] + np.arange(chunk)]
 
 
 def observed_steps(episode: DemoEpisode, sees: bool) -> np.ndarray:
@@ -156,7 +156,7 @@ def observations_of(
         CheckpointError: The target reads images, but a step has no image, or images have a different size than the
             target takes.
     """
-    pictures: list[dict[str, np.ndarray]] = [{} for _ in steps]
+    frames: Any = [None] * len(steps)
     if target.cameras:
         if frame_shape := getattr(target, "frame_shape", None):
             check_frames(episode, frame_shape[0])
@@ -164,12 +164,11 @@ def observations_of(
         missing = steps[episode.frame_steps[rows] != steps]
         if len(missing):
             raise CheckpointError(f"step {missing[0]} of {episode.task} {episode.seed} has no frame: record every step")
-        pictures = [dict.fromkeys(target.cameras, frame) for frame in np.asarray(episode.frames[rows])]
-    states, instruction = episode.states[steps].astype(np.float64), instruction_of(episode.task)
-    count = len(space.proprioception)
-    return [
-        Observation(state[:count], state, instruction, images) for state, images in zip(states, pictures, strict=True)
-    ]
+        frames = np.asarray(episode.frames[rows])
+    count, instruction, found = len(space.proprioception), instruction_of(episode.task), []
+    for state, frame in zip(episode.states[steps].astype(np.float64), frames, strict=True):
+        found.append(Observation(state[:count], state, instruction, dict.fromkeys(target.cameras, frame)))
+    return found
 
 
 def prompts_of(target: Target, observations: Iterable[Observation], size: int = BATCH) -> Iterator[Tensor]:
@@ -188,7 +187,7 @@ def prompts_of(target: Target, observations: Iterable[Observation], size: int = 
         if isinstance(target, EncodesMany):
             yield target.encode_many(batch)
             continue
-        prompts = (target.encode(observation) for observation in batch)
+        prompts = map(target.encode, batch)
         yield from (torch.cat(list(equal)) for _, equal in itertools.groupby(prompts, lambda prompt: prompt.shape[1]))
 
 

@@ -115,8 +115,11 @@ class PublicDrafter(nn.Module):
         if cache is not None and not cache.length:
             cache.prompt = hidden.shape[1]
         x = self.fc(torch.cat([following, hidden], -1))
-        mask = self.prompt_mask(x, cache, seen) if self.shape.convention.mask == "prompt" else None
-        return run_layers(self.layers, self.shape.language, x, positions, cache, seen, mask)
+        if self.shape.convention.mask == "prompt":
+            mask: Tensor | None = self.prompt_mask(x, cache, seen)
+        else:
+            mask = attention_mask(seen, x.shape[1], cache, x)
+        return run_layers(self.layers, self.shape.language, x, positions, cache, mask)
 
     def prompt_mask(self, x: Tensor, cache: DraftCache | None, seen: np.ndarray | Tensor | None) -> Tensor:
         """Return the additive attention mask for `mask=prompt`.

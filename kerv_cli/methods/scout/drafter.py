@@ -26,10 +26,9 @@ from kerv_cli.methods.context import Context
 from kerv_cli.methods.drafters import Decodes, Metrics
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyNetwork, EarlyProposer
 from kerv_cli.methods.scout import ScoutSettings
-from kerv_cli.targets.compact.features import hand_features, mlp, scene_features, scene_width
+from kerv_cli.targets.compact.features import VisionEncoder, hand_features, mlp, scene_features, scene_width
 from kerv_cli.targets.compact.program import Compilable, Program
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
-from kerv_cli.targets.compact.vision import VisionEncoder
 from kerv_cli.targets.losses import position_loss
 from kerv_cli.targets.observations import BATCH, Observations, read_observations
 from kerv_cli.worlds.demos.files import DemoEpisode

@@ -166,17 +166,9 @@ _MATRICES = WeakIdKeyDictionary()
 """The `Matrix` of each weight tensor. Programs with the same layer share the matrix."""
 
 
-def matrix_of(weight: Tensor, bias: Tensor | None) -> Matrix:
-    """Return the `Matrix` of a linear layer. For each weight tensor, the matrix is built once."""
-    if weight not in _MATRICES:
-        _MATRICES[weight] = Matrix(weight.detach(), bias)
-    found: Matrix = _MATRICES[weight]
-    return found
-
-
 def stored_bytes(tensors: Iterable[Tensor]) -> float:
     """Return the bytes of memory that weights take. Compiled weights count as they are stored in their `Matrix`."""
-    return float(sum(_MATRICES[x].nbytes if x in _MATRICES else x.nbytes for x in tensors))
+    return float(sum(_MATRICES.get(x, x).nbytes for x in tensors))
 
 
 _WITHOUT_ATTENTION = Cache(1, 1, 1, 1, 1, torch.empty(0))
@@ -197,7 +189,7 @@ class Program:
         """
         tape = Tape()
         with torch.no_grad():
-            inputs = [tape.register(*shape) for shape in shapes]
+            inputs = list(map(tape.register, shapes))
             found = function(*inputs)
         outputs = [tape.lined(x, x.shape[-1]) for x in (found if isinstance(found, tuple) else (found,))]
         if repeats:
@@ -210,7 +202,10 @@ class Program:
         self.blocked: list[tuple[int, Blocked, list[tuple[slice, slice]]]] = []
         for i, op in enumerate(tape.ops):
             if "matrix" in op:
-                matrix = matrix_of(*op["matrix"])
+                weight, bias = op["matrix"]
+                if weight not in _MATRICES:
+                    _MATRICES[weight] = Matrix(weight.detach(), bias)
+                matrix: Matrix = _MATRICES[weight]
                 self.matrices.append(matrix)
                 op |= matrix.columns
                 if matrix.blocked is not None:
@@ -386,9 +381,10 @@ class Compilable(nn.Module):
 
         While a program is recorded, the inputs are `Recorded`, and torch's form of the module is recorded.
         """
-        if self.compiled is None or not all(isinstance(x, Tensor) for x in inputs):
-            return False
-        return not (torch.is_grad_enabled() and any(x.requires_grad for x in inputs))
+        for x in inputs:
+            if not isinstance(x, Tensor) or (x.requires_grad and torch.is_grad_enabled()):
+                return False
+        return self.compiled is not None
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "compiled": None}  # it contains memory addresses or a session of ONNX Runtime

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from kerv_cli.engine.protocol import Seen
 from kerv_cli.engine.transfer import upload
-from kerv_cli.targets.attention import Cache, CapturedCache, Slots, attend, attention_mask, rotate
+from kerv_cli.targets.attention import Cache, CapturedCache, Rotation, Slots, attend, attention_mask, rotate
 from kerv_cli.targets.compact.program import Compilable, Program
 
 POSITIONS, BASE = 1024, 10_000.0  # of the rotary embedding: number of positions, base of the frequencies
@@ -40,7 +40,7 @@ class Rotary(nn.Module):
         # the sign of the swapped half is folded into the table: x·cos + swap(x)·sin
         self.register_buffer("sin", torch.cat([-angles.sin(), angles.sin()], -1), persistent=False)
 
-    def forward(self, positions: Tensor | slice) -> tuple[Tensor, Tensor]:
+    def forward(self, positions: Tensor | slice) -> Rotation:
         """Return the cosines and the sines, (T, 1, C) each, at positions (T,)."""
         return self.cos[positions][:, None], self.sin[positions][:, None]
 
@@ -59,12 +59,7 @@ class Layer(nn.Module):
         self.down = nn.Linear(feed_forward, width, bias=False)
 
     def forward(
-        self,
-        x: Tensor,
-        rotary: tuple[Tensor, Tensor],
-        cache: Tensor | None = None,
-        slots: Slots | None = None,
-        mask: Tensor | None = None,
+        self, x: Tensor, rotary: Rotation, cache: Tensor | None = None, slots: Slots = None, mask: Tensor | None = None
     ) -> Tensor:
         """Compute the output (B, T, width) of the layer.
 
@@ -192,7 +187,7 @@ class LayerStack(Compilable):
         return self.finish(self.run_layers(self.begin(*inputs), slice(None), None, None, None))
 
     def run_layers(
-        self, x: Tensor, positions: Tensor | slice, cache: Cache | None, slots: Slots | None, mask: Tensor | None
+        self, x: Tensor, positions: Tensor | slice, cache: Cache | None, slots: Slots, mask: Tensor | None
     ) -> Tensor:
         """Return the output of the last layer, computed by torch.
 

@@ -80,7 +80,7 @@ def open_shards(folder: Path) -> Shards:
     Raises:
         CheckpointError: The folder has no such files, or only pickled weights, or a file is damaged.
     """
-    files = [path for path in visible(folder) if path.suffix == ".safetensors"]
+    files = sorted(folder.glob("[!.]*.safetensors"))
     if not files:
         pickled = [path.name for path in visible(folder) if path.suffix in PICKLED]
         if pickled:
@@ -131,9 +131,9 @@ def layout(shape: Shape) -> dict[str, Sizes]:
 
 def is_unread(name: str, shape: Shape) -> bool:
     """Return whether a tensor has no effect, because it is in a tower's last block, final norm or pooling head."""
-    first, second = (tower.depth - 1 for tower in shape.towers)
-    parts = rf"(featurizer\.blocks\.{first}|fused_featurizer\.blocks\.{second}|\w+\.norm|\w+\.attn_pool)\."
-    return re.match(rf"vision_backbone\.{parts}", name) is not None
+    dino, siglip = shape.towers
+    last = rf"featurizer\.blocks\.{dino.depth - 1}|fused_featurizer\.blocks\.{siglip.depth - 1}"
+    return re.match(rf"vision_backbone\.({last}|\w+\.norm|\w+\.attn_pool)\.", name) is not None
 
 
 def sizes_of(module: nn.Module) -> dict[str, Sizes]:

@@ -18,16 +18,14 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kerv_cli.engine.protocol import Seen
-from kerv_cli.targets.attention import Cache, Slots, attend, attention_mask, rotate
+from kerv_cli.targets.attention import Cache, Rotation, Slots, attend, attention_mask, rotate
 from kerv_cli.targets.openvla.config import Language, Shape, Tower
 
 EPSILON = 1e-6  # of every layer norm
-Rotary = tuple[Tensor, Tensor]
-"""Cosines and sines (T, C) of the rotary embedding."""
 
 
-def rotation(positions: Tensor, channels: int, theta: float, dtype: torch.dtype) -> Rotary:
-    """Return the cosines and sines of the rotary embedding in half-split layout. They are computed in float32.
+def rotation(positions: Tensor, channels: int, theta: float, dtype: torch.dtype) -> Rotation:
+    """Return the cosines and sines (T, C) of the rotary embedding in half-split layout. They are computed in float32.
 
     In the first half of the channels the sines have the reversed sign, as `attention.rotate` requires.
 
@@ -56,7 +54,7 @@ class LlamaAttention(nn.Module):
         self.o_proj = nn.Linear(width, width, bias=False)
 
     def forward(
-        self, x: Tensor, rotary: Rotary, mask: Tensor | None, cache: Tensor | None = None, slots: Slots | None = None
+        self, x: Tensor, rotary: Rotation, mask: Tensor | None, cache: Tensor | None = None, slots: Slots = None
     ) -> Tensor:
         """Return the attention's output (B, T, E).
 
@@ -105,7 +103,7 @@ class LlamaLayer(nn.Module):
         self.mlp = LlamaPerceptron(language)
 
     def forward(
-        self, x: Tensor, rotary: Rotary, mask: Tensor | None, cache: Tensor | None = None, slots: Slots | None = None
+        self, x: Tensor, rotary: Rotation, mask: Tensor | None, cache: Tensor | None = None, slots: Slots = None
     ) -> Tensor:
         """Return the layer's output (B, T, E) for x (B, T, E). `LlamaAttention.forward` explains the arguments."""
         x = x + self.self_attn(self.input_layernorm(x), rotary, mask, cache, slots)
@@ -113,13 +111,7 @@ class LlamaLayer(nn.Module):
 
 
 def run_layers(
-    layers: nn.ModuleList,
-    language: Language,
-    x: Tensor,
-    positions: Tensor,
-    cache: Cache | None,
-    seen: Seen,
-    mask: Tensor | None = None,
+    layers: nn.ModuleList, language: Language, x: Tensor, positions: Tensor, cache: Cache | None, mask: Tensor | None
 ) -> Tensor:
     """Run all layers over T new tokens, and return the output (B, T, E) of the last layer.
 
@@ -129,11 +121,9 @@ def run_layers(
         x: (B, T, E) embeddings of the new tokens.
         positions: (T,) rotary positions of the new tokens.
         cache: Keys and values of earlier tokens. This forward appends the new ones. None: no earlier tokens.
-        seen: (T, M) bool, which of the last M tokens, old or new, each new token attends to. None: causal mask.
-        mask: Additive mask to use instead of `seen`. None: the mask is made from `seen`.
+        mask: Result of `attention_mask`. None: attention is causal.
     """
     rotary = rotation(positions, language.channels, language.rope_theta, x.dtype)
-    mask = attention_mask(seen, x.shape[1], cache, x) if mask is None else mask
     slots = cache.next_slots(x.shape[1]) if cache is not None else None
     for i, layer in enumerate(layers):
         x = layer(x, rotary, mask, cache.layers[i] if cache is not None else None, slots)
@@ -153,8 +143,9 @@ class LlamaModel(nn.Module):
         self.norm = nn.RMSNorm(language.hidden_size, eps=language.rms_norm_eps)
 
     def forward(self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: Seen = None) -> Tensor:
-        """Return the hidden states (B, T, E) of embeddings x (B, T, E). `run_layers` explains the arguments."""
-        return self.norm(run_layers(self.layers, self.language, x, positions, cache, seen))
+        """Return the hidden states (B, T, E) of embeddings x (B, T, E). `Target.forward` explains the arguments."""
+        mask = attention_mask(seen, x.shape[1], cache, x)
+        return self.norm(run_layers(self.layers, self.language, x, positions, cache, mask))
 
 
 class LanguageModel(nn.Module):

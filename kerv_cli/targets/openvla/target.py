@@ -12,7 +12,6 @@ per side of an image.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -85,26 +84,15 @@ class OpenVLATarget:
         self.model = model = load_model(source, shape, device, dtype, settings.int8)
         self.chunk, self.width = settings.chunk, shape.language.hidden_size
         self.heads, self.feed_forward = shape.language.num_attention_heads, shape.language.intermediate_size
-        self.max_prompt = shape.patches + settings.prompt_tokens
+        self.max_prompt, self.pooled_width = shape.patches + settings.prompt_tokens, 2 * self.width
+        # instructions differ in length, so the instruction's slice has no end
+        begin, vision = slice(0, 1), slice(1, 1 + shape.patches)
+        self.segments = {"begin": begin, "vision": vision, "instruction": slice(vision.stop, None)}
         last = shape.vocabulary
         self.action_rows = model.language_model.lm_head.weight[last - shape.bins : last].flip(0).contiguous()
         self.layers = model.language_model.model.layers
         self.device, self.dtype = self.action_rows.device, self.action_rows.dtype
         self.words = functools.lru_cache(maxsize=64)(self._words)
-
-    @property
-    def segments(self) -> Mapping[str, slice]:
-        """Map from the name of each part of the prompt to the positions of its tokens (a slice).
-
-        The instruction's slice has no end, because instructions differ in length.
-        """
-        patches = self.shape.patches
-        return {"begin": slice(0, 1), "vision": slice(1, 1 + patches), "instruction": slice(1 + patches, None)}
-
-    @property
-    def pooled_width(self) -> int:
-        """F, number of values that `pooled` returns per prompt."""
-        return 2 * self.width
 
     def pooled(self, prompt: Tensor) -> Tensor:
         """Pool each prompt (B, P, E) into one vector (B, F): the mean vision token, then the mean text token."""
@@ -248,11 +236,8 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
     described = {"format": FORMAT, "kind": "target", "sha256": digest_of(hashes, chosen), **fields}
     write_json(folder / "target.json", described)
     sizes = {"prompt tokens": shape.patches + len(prompt), "action tokens": actions.tokens, "DoFs": actions.dofs}
-    return folder, {"parameters": parameters, **sizes, **(_parity(folder, settings) if settings.check else {})}
-
-
-def _parity(folder: Path, settings: BuildTargetSettings) -> dict[str, float]:
-    """Return how the target compares with transformers, by name (`reference.parity`)."""
-    device, _ = set_up(settings.runtime)
-    target: Any = load_target(folder, device, DTYPES[settings.runtime.dtype])[0]
-    return parity(target)
+    compared = {}
+    if settings.check:
+        device, _ = set_up(settings.runtime)
+        compared = parity(load_target(folder, device, DTYPES[settings.runtime.dtype])[0])
+    return folder, {"parameters": parameters, **sizes, **compared}
