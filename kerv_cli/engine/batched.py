@@ -52,10 +52,16 @@ class BatchDecoder:
                 cache.length = 0
                 chunk.take(self.skip.take(chunk))
             chunks.append(chunk)
-        verified = [chunk for chunk in chunks if chunk.remaining]
-        for chunk, tokens in zip(verified, self._tokens(verified), strict=True):
-            for token in chunk.until_end(tokens):
-                chunk.commit_token(token)
+        groups: dict[int, list[Chunk]] = {}  # chunks with equally long prompts are decoded together, unpadded
+        for chunk in chunks:
+            if chunk.remaining:
+                groups.setdefault(chunk.target.prompt_length, []).append(chunk)
+        for group in groups.values():
+            prompt = torch.cat([chunk.target.prompt for chunk in group])
+            decoded, _ = greedy(self.target, prompt, self._cache(len(group)), self.size)
+            for chunk, tokens in zip(group, decoded.tolist(), strict=True):
+                for token in chunk.until_end(tokens):
+                    chunk.commit_token(token)
         for chunk in chunks:
             chunk.situation.last[:] = chunk.tokens
         similarity = self.decoder.parts.similarity
@@ -69,19 +75,6 @@ class BatchDecoder:
         if isinstance(self.target, EncodesMany) and self.target.device.type != "cpu":
             return list(self.target.encode_many(observations).split(1))
         return [self.target.encode(observation) for observation in observations]
-
-    def _tokens(self, chunks: Sequence[Chunk]) -> list[list[int]]:
-        """Decode N tokens per chunk greedily. Chunks with equally long prompts are decoded together, unpadded."""
-        groups: dict[int, list[int]] = {}
-        for i, chunk in enumerate(chunks):
-            groups.setdefault(chunk.target.prompt_length, []).append(i)
-        tokens: list[list[int]] = [[]] * len(chunks)
-        for group in groups.values():
-            prompt = torch.cat([chunks[i].target.prompt for i in group])
-            decoded, _ = greedy(self.target, prompt, self._cache(len(group)), self.size)
-            for i, row in zip(group, decoded.tolist(), strict=True):
-                tokens[i] = row
-        return tokens
 
     def _cache(self, rows: int) -> Cache:
         """Return an empty cache for `rows` sequences.

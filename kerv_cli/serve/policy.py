@@ -5,7 +5,6 @@ from __future__ import annotations
 import abc
 import math
 import threading
-from collections.abc import Callable
 from dataclasses import asdict, fields
 from typing import Any
 
@@ -175,9 +174,6 @@ class Finite:
             raise KervError("the policy computed numbers that are not finite: no action is sent")
 
 
-Log = Callable[[str], None]
-
-
 class Conversation(abc.ABC):
     """One client's connection: its decoder and its episodes. Each protocol is a subclass.
 
@@ -194,8 +190,8 @@ class Conversation(abc.ABC):
     ping_s: float | None
     idle_s: float
 
-    def __init__(self, policy: Policy, log: Log = lambda line: None) -> None:
-        self.policy, self.interface, self.log = policy, policy.interface, log
+    def __init__(self, policy: Policy) -> None:
+        self.policy, self.interface = policy, policy.interface
         self.task, self.last_ms = policy.task, math.nan
         self.decoder: Any = None if policy.by_task else policy.lend_decoder(self.task)
 

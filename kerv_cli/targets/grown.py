@@ -63,12 +63,8 @@ def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
     old: list[Any] = [copy.deepcopy(layer).float() for layer in stack.layers]
     stack.compiled = None
     units, channels = old[0].down.in_features, stack.width // stack.heads
-    for name, value, least in (
-        ("width", shape.width, stack.width),
-        ("heads", shape.heads, stack.heads),
-        ("feed_forward", shape.feed_forward, units),
-        ("layers", layers, len(old)),
-    ):
+    for name, least in {"width": stack.width, "heads": stack.heads, "feed_forward": units, "layers": len(old)}.items():
+        value = layers if name == "layers" else getattr(shape, name)
         if value < least:
             raise UsageError(f"grow.{name}={value}: the policy has {least}, and only growing keeps what it computes")
     if shape.width % (shape.heads * channels):

@@ -22,7 +22,7 @@ from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.targets.attention import Cache, attention_mask
 from kerv_cli.targets.checkpoint import WEIGHTS, load_tensors
 from kerv_cli.targets.openvla.config import CONFIG, Language
-from kerv_cli.targets.openvla.loading import SINGLE, Sizes, check_layout, open_shards, sizes_of
+from kerv_cli.targets.openvla.loading import Sizes, check_layout, open_shards, sizes_of
 from kerv_cli.targets.openvla.network import LlamaLayer, run_layers
 
 EMBEDDING = "embed_tokens.weight"
@@ -165,9 +165,9 @@ def read_public(folder: Path, target: ReadableTarget, convention: Convention) ->
     """
     config, pickled = folder / CONFIG, folder / "pytorch_model.bin"
     language = read(Language, read_json(config), str(config), tolerant=True)
-    if not (folder / SINGLE).is_file() and pickled.is_file():
+    if not (folder / WEIGHTS).is_file() and pickled.is_file():
         raise CheckpointError(
-            f"{pickled} is pickled and can run code when it is opened: convert it to {SINGLE} where you trust it"
+            f"{pickled} is pickled and can run code when it is opened: convert it to {WEIGHTS} where you trust it"
         )
     if language.hidden_size != target.width:
         raise CheckpointError(f"the drafter in {folder} is {language.hidden_size} wide, the target {target.width}")

@@ -298,24 +298,11 @@ class CompactTarget(Compilable):
         return Programs(Program(self.prompt, *shapes), Program(step, (1, 1), repeats=True))
 
     def join(self, function: Callable[..., Any], *shapes: tuple[int, ...], repeats: bool = False) -> Program | None:
-        """Compile a function that calls modules of the target and of a compiled drafter.
-
-        Args:
-            function: The function. Its inputs are float32 tensors of batch size 1.
-            shapes: Shape of each input.
-            repeats: Whether the program can run several times in one call. The outputs of each run are the inputs of
-                the next, to decode or draft several tokens.
-
-        Returns:
-            The compiled program. None if the target is not compiled.
-        """
+        """Compile a function that calls modules of the target and of a compiled drafter; see `JoinsDrafters.join`."""
         return Program(function, *shapes, repeats=repeats) if self.compiled is not None else None
 
     def enlarge(self, drafter: Any) -> None:
-        """Enlarge a small policy's drafter in place, so that it fits this target.
-
-        Does nothing if this target was not made by enlarging a small policy (docs/methods.md §0.2).
-        """
+        """Enlarge a small policy's drafter in place, if this target was made by enlarging a small policy."""
         if self.enlarges is not None:
             self.enlarges(drafter)
 
@@ -324,13 +311,7 @@ class CompactTarget(Compilable):
         return self.embedding(tokens)
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
-        """Return an empty key/value cache.
-
-        Args:
-            batch: Number of sequences.
-            capacity: Maximum number of tokens.
-            fixed: Whether every forward attends to all slots, so that its shapes are fixed. None: only on CUDA.
-        """
+        """Return an empty key/value cache. `LayerStack.new_cache` explains the arguments."""
         return self.trunk.new_cache(batch, capacity, fixed)
 
     def forward(self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: Seen = None) -> Tensor:
@@ -338,16 +319,9 @@ class CompactTarget(Compilable):
         return self.trunk(x, positions, cache, seen)
 
     def continue_greedily(self, token: int, count: int, cache: Cache, end: int | None = None) -> list[int] | None:
-        """Decode the next `count` tokens greedily in one compiled call.
+        """Decode the next `count` tokens greedily in one compiled call. None if this target is not compiled.
 
-        Args:
-            token: The last token, not yet in the cache.
-            count: Number of tokens to decode.
-            cache: Keys and values of all tokens before `token`. The cache grows by the number of decoded tokens.
-            end: Token after which to stop. None: decode all `count` tokens.
-
-        Returns:
-            The tokens. None if this target is not compiled.
+        `ContinuesGreedily` explains the arguments.
         """
         if self.compiled is None or cache.fixed:
             return None

@@ -25,7 +25,6 @@ from kerv_cli.targets.openvla.config import CONFIG, Shape
 from kerv_cli.targets.openvla.network import OpenVLAModel, quantise
 
 Sizes = tuple[int, ...]
-SINGLE = "model.safetensors"
 PICKLED = (".bin", ".pt", ".pth", ".ckpt")
 LISTED = 3  # maximum number of tensors of each kind that an error message names
 
@@ -108,12 +107,8 @@ def check_layout(shapes: Mapping[str, Sizes], expected: Mapping[str, Sizes], whe
     Raises:
         CheckpointError: Tensors are missing, unknown or have a wrong shape. The message names up to three of each kind.
     """
-    missing, unknown, reshaped = [], [name for name in shapes if name not in expected], []
-    for name, size in expected.items():
-        if name not in shapes:
-            missing.append(name)
-        elif shapes[name] != size:
-            reshaped.append(f"{name} {shapes[name]}, not {size}")
+    missing, unknown = [n for n in expected if n not in shapes], [n for n in shapes if n not in expected]
+    reshaped = [f"{n} {shapes[n]}, not {size}" for n, size in expected.items() if shapes.get(n, size) != size]
     wrong = []
     for kind, names in (("missing", missing), ("unknown", unknown), ("of another shape", reshaped)):
         if names:

@@ -15,7 +15,7 @@ from torch.nn.functional import gelu, linear
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder
-from kerv_cli.targets.openvla.config import read_shape
+from kerv_cli.targets.openvla.config import Tower, read_shape
 from kerv_cli.targets.openvla.inputs import pixels_of
 from kerv_cli.targets.openvla.loading import is_unread, open_shards
 
@@ -87,35 +87,20 @@ class Reference:
         from transformers import Dinov2WithRegistersConfig, Dinov2WithRegistersModel
 
         tower = self.shape.towers[0]
-        config = Dinov2WithRegistersConfig(
-            hidden_size=tower.width,
-            num_hidden_layers=tower.depth - 1,  # OpenVLA takes the last but one
-            num_attention_heads=tower.heads,
-            mlp_ratio=tower.feed_forward // tower.width,
-            num_register_tokens=tower.registers,
-            image_size=tower.image,
-            patch_size=tower.patch,
-        )
+        hidden: Any = {"mlp_ratio": tower.feed_forward // tower.width, "num_register_tokens": tower.registers}
         weights = _renamed(self._part("vision_backbone.featurizer."), _DINO)
         # timm adds positions to the patches alone: transformers' class token gets a position of zero
         nowhere = torch.zeros(1, 1, tower.width)
         weights["embeddings.position_embeddings"] = torch.cat([nowhere, weights["embeddings.position_embeddings"]], 1)
         weights["embeddings.mask_token"] = nowhere[0]
-        return self._loaded(Dinov2WithRegistersModel(config), weights)
+        return self._loaded(Dinov2WithRegistersModel(Dinov2WithRegistersConfig(**hidden, **_sizes(tower))), weights)
 
     def _siglip(self) -> Any:
         from transformers import SiglipVisionConfig, SiglipVisionModel
 
         tower = self.shape.towers[1]
-        config = SiglipVisionConfig(
-            hidden_size=tower.width,
-            intermediate_size=tower.feed_forward,
-            num_hidden_layers=tower.depth - 1,
-            num_attention_heads=tower.heads,
-            image_size=tower.image,
-            patch_size=tower.patch,
-            hidden_act="gelu",  # timm's; transformers' own default is its tanh approximation
-        )
+        # this GELU is timm's; transformers' own default is its tanh approximation
+        config = SiglipVisionConfig(intermediate_size=tower.feed_forward, hidden_act="gelu", **_sizes(tower))
         weights = _renamed(self._part("vision_backbone.fused_featurizer."), _SIGLIP)
         weights["embeddings.position_embedding.weight"] = weights["embeddings.position_embedding.weight"][0]
         return self._loaded(SiglipVisionModel(config), weights)
@@ -156,6 +141,13 @@ class Reference:
         x = torch.cat([words[:, :1], self.patches(pixels), words[:, 1:]], 1)
         found: Tensor = self.llama(inputs_embeds=x).logits[0, -len(following) - 1 :]
         return found
+
+
+def _sizes(tower: Tower) -> dict[str, Any]:
+    """Return the sizes that transformers' configurations of both towers have."""
+    image = {"image_size": tower.image, "patch_size": tower.patch}
+    layers = {"num_hidden_layers": tower.depth - 1}  # OpenVLA takes the last but one
+    return {"hidden_size": tower.width, "num_attention_heads": tower.heads, **layers, **image}
 
 
 def _renamed(weights: Mapping[str, Tensor], names: Mapping[str, str]) -> dict[str, Tensor]:
