@@ -159,7 +159,7 @@ class Prompter:
         except ImportError as error:
             raise KervError("OpenVLA checkpoints need the package tokenizers: pip install 'kerv[openvla]'") from error
         try:
-            self.tokenizer = Tokenizer.from_file(str(path))
+            self.tokenizer: Any = Tokenizer.from_file(str(path))
         except Exception as error:
             raise CheckpointError(f"{path} cannot be read ({str(error)[:120]}): copy it again") from error
         self.text, self.limit = PROMPTS[form], limit
