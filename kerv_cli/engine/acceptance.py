@@ -17,10 +17,6 @@ from kerv_cli.engine.tree import ROOT, TokenTree
 if TYPE_CHECKING:
     from kerv_cli.base.spaces import ActionSpace
 
-Bounds = Sequence[tuple[int, int]]
-"""For each DoF: the index of the first DoF of its kinematic group, and the index after the last one
-(`ActionSpace.bounds`)."""
-
 
 class Accepted(NamedTuple):
     """The draft nodes that an acceptance rule accepts, and the one it rejects.
@@ -42,7 +38,7 @@ def accept_by_group(
     limits: Sequence[int],
     *,
     group_limit: int,
-    bounds: Bounds,
+    bounds: Sequence[tuple[int, int]],
 ) -> Accepted:
     """Return the longest path of whole kinematic groups, such as position or rotation (HeiSD's `sequence` rule).
 
@@ -60,7 +56,8 @@ def accept_by_group(
         start: Number of committed tokens. A node at depth d is token start + d of the chunk.
         limits: Largest accepted distance per DoF, in bins.
         group_limit: Largest accepted sum of a group's distances, in bins.
-        bounds: For each DoF, the index of the first DoF of its group and the index after the last one.
+        bounds: For each DoF, the index of the first DoF of its kinematic group and the index after the last one
+            (`ActionSpace.bounds`).
     """
     alive = [False] * len(tree)  # whether no limit is broken on the path to this node
     in_group = [0] * len(tree)  # distances summed within the node's group

@@ -159,7 +159,7 @@ class Prompter:
         except ImportError as error:
             raise KervError("OpenVLA checkpoints need the package tokenizers: pip install 'kerv[openvla]'") from error
         try:
-            self.tokenizer: Any = Tokenizer.from_file(str(path))
+            self.tokenizer = Tokenizer.from_file(str(path))
         except Exception as error:
             raise CheckpointError(f"{path} cannot be read ({str(error)[:120]}): copy it again") from error
         self.text, self.limit = PROMPTS[form], limit
@@ -176,7 +176,7 @@ class Prompter:
         Raises:
             UsageError: The prompt has too many ids. It is not cut, because a decisive word could be lost.
         """
-        ids: list[int] = self.tokenizer.encode(self.text.format(instruction.lower())).ids
+        ids: list[Any] = self.tokenizer.encode(self.text.format(instruction.lower())).ids
         if ids[:1] != [self.begin]:
             ids = [self.begin, *ids]
         if ids[-1] != self.boundary:

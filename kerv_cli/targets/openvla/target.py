@@ -109,13 +109,10 @@ class OpenVLATarget:
         if camera not in observation.images:
             raise CheckpointError(f"the target sees camera '{camera}', whose image was not drawn")
         image, settings = observation.images[camera], self.settings
-        patches = self.see(pixels_of(image, self.shape, self.normalisations, settings.crop, settings.libero))
+        pixels = pixels_of(image, self.shape, self.normalisations, settings.crop, settings.libero)
+        patches = self.model.projector(self.model.vision_backbone(upload(pixels, self.device).to(self.dtype)))
         words = self.words(observation.instruction)
         return torch.cat([words[:, :1], patches, words[:, 1:]], 1)
-
-    def see(self, pixels: Tensor) -> Tensor:
-        """Map images from `pixels_of`, (B, 6, s, s), to n vision tokens per image, (B, n, E)."""
-        return self.model.projector(self.model.vision_backbone(upload(pixels, self.device).to(self.dtype)))
 
     def _words(self, instruction: str) -> Tensor:
         ids = upload([self.prompter.ids(instruction)], self.device)
