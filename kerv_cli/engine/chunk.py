@@ -211,6 +211,14 @@ class Chunk:
         """Largest number of tokens that can still be decoded. 0 if the chunk has ended."""
         return 0 if self.ended else self.size - len(self.tokens)
 
+    @property
+    def variability(self) -> float | None:
+        """Kinematic variability K: the mean difference of draft and target tokens, in normalised action units.
+
+        None if no draft token was compared (docs/methods.md §3.2).
+        """
+        return variability(self.rounds, self.space)
+
     def distance(self, tokens: Sequence[int], others: Sequence[int]) -> float:
         """Return the mean absolute difference of two token sequences, in normalised action units.
 
@@ -329,7 +337,7 @@ class Chunk:
             phases=phases,
             compensated=len(self.filled) if self.closed is None else max(0, self.closed.size - len(self.tokens)),
             filled=tuple(self.filled),
-            variability=variability(self.rounds, self.space),
+            variability=self.variability,
             skipped=any(one.mode == "skip" for one in self.rounds),
             similarity=similarity,
             metric=self.choice.metric if self.choice is not None else None,
