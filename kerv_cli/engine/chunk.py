@@ -212,6 +212,11 @@ class Chunk:
         return 0 if self.ended else self.size - len(self.tokens)
 
     @property
+    def compensated(self) -> int:
+        """Number of action values that a rectifier predicted instead of the target."""
+        return len(self.filled) if self.closed is None else max(0, self.closed.size - len(self.tokens))
+
+    @property
     def variability(self) -> float | None:
         """Kinematic variability K: the mean difference of draft and target tokens, in normalised action units.
 
@@ -335,7 +340,7 @@ class Chunk:
             mode=next(filter(None, (one.drafter for one in self.rounds)), "ar"),
             seconds=seconds,
             phases=phases,
-            compensated=len(self.filled) if self.closed is None else max(0, self.closed.size - len(self.tokens)),
+            compensated=self.compensated,
             filled=tuple(self.filled),
             variability=self.variability,
             skipped=any(one.mode == "skip" for one in self.rounds),
