@@ -90,8 +90,7 @@ def write_policy(results: Path, name: str, observation: str, seed: int = 0) -> N
     from kerv_cli.methods.artifacts import MadeFor
     from kerv_cli.methods.eagle import DrafterSettings
     from kerv_cli.methods.eagle.drafter import EagleDrafter
-    from kerv_cli.targets.compact.folder import save_target
-    from kerv_cli.targets.compact.target import CompactTarget
+    from kerv_cli.targets.compact.target import CompactTarget, save_target
     from kerv_cli.training.settings import TrainTargetSettings
     from kerv_cli.training.target import vocabulary
     from kerv_cli.worlds.metaworld.spec import SPEC

@@ -39,7 +39,7 @@ from kerv_cli.report.profiles import NamedProfile
 from kerv_cli.report.reprice import repriced
 from kerv_cli.report.summary import summary_frame
 from kerv_cli.report.tables import load_study
-from kerv_cli.targets.compact.compilable import compile_parts
+from kerv_cli.targets.compact.program import compile_parts
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 HOME = np.zeros(3)

@@ -29,15 +29,12 @@ from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.methods.unverified import ParallelPass
 from kerv_cli.targets.attention import CapturedCache, attention_mask, bucket
 from kerv_cli.targets.checkpoint import load_target
-from kerv_cli.targets.compact.compilable import compile_parts
-from kerv_cli.targets.compact.features import places_of, privileged_features, scene_features, scene_width
-from kerv_cli.targets.compact.folder import save_target
-from kerv_cli.targets.compact.settings import TargetSettings
-from kerv_cli.targets.compact.target import CompactTarget, Inputs
-from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.targets.compact.features import WordTokenizer, places_of, privileged_features, scene_features, scene_width
+from kerv_cli.targets.compact.program import compile_parts
+from kerv_cli.targets.compact.target import CompactTarget, Inputs, save_target
 from kerv_cli.targets.compact.trunk import Trunk
 from kerv_cli.targets.grown import grow_stack
-from kerv_cli.targets.settings import GrowSettings
+from kerv_cli.targets.settings import GrowSettings, TargetSettings
 from kerv_cli.training.settings import TrainTargetSettings
 from kerv_cli.training.target import check_init, continued_target
 from kerv_cli.worlds.metaworld.spec import SPEC

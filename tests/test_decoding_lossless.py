@@ -24,10 +24,10 @@ from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter, EagleNetwork
 from kerv_cli.methods.reuse import JacobiProposer, JacobiProposerSettings
-from kerv_cli.targets.compact.compilable import compile_parts
-from kerv_cli.targets.compact.settings import TargetSettings
+from kerv_cli.targets.compact.features import WordTokenizer
+from kerv_cli.targets.compact.program import compile_parts
 from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 pytestmark = pytest.mark.bits

@@ -18,13 +18,11 @@ from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early.drafter import choose
 from kerv_cli.targets.checkpoint import compact, expanded
 from kerv_cli.targets.compact import program
-from kerv_cli.targets.compact.bfloat16 import multiplies_bfloat16
-from kerv_cli.targets.compact.compilable import compile_parts
-from kerv_cli.targets.compact.program import Program, kernels, own_folder
-from kerv_cli.targets.compact.settings import TargetSettings
+from kerv_cli.targets.compact.features import WordTokenizer
+from kerv_cli.targets.compact.program import Program, compile_parts, kernels, multiplies_bfloat16, own_folder
 from kerv_cli.targets.compact.target import CompactTarget, Inputs
-from kerv_cli.targets.compact.text import WordTokenizer
 from kerv_cli.targets.compact.trunk import Trunk
+from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 pytestmark = pytest.mark.bits

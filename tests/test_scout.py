@@ -32,7 +32,7 @@ from kerv_cli.methods.unverified import AlwaysSkip, StreakSkip, StreakSkipSettin
 from kerv_cli.report.betting import p_value, wealth
 from kerv_cli.report.certificate import folder_of
 from kerv_cli.targets.checkpoint import load_target
-from kerv_cli.targets.compact.compilable import compile_parts
+from kerv_cli.targets.compact.program import compile_parts
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.training.settings import PrepareSettings
 

@@ -15,9 +15,9 @@ import torch
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.manifests import read_file
-from kerv_cli.targets.compact.settings import TargetSettings
-from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.targets.compact.features import WordTokenizer
 from kerv_cli.targets.observations import Observations, read_observations
+from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset, DemoManifest
 from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames, StreamedFrames, load_episode, save_episode
 from kerv_cli.worlds.demos.recording import DemoConfig, Perturbation, is_perturbed, record

@@ -16,7 +16,7 @@ from kerv_cli.base.codes import FastCode
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace
-from kerv_cli.targets.compact.text import PAD, UNKNOWN, WordTokenizer
+from kerv_cli.targets.compact.features import PAD, UNKNOWN, WordTokenizer
 from kerv_cli.worlds import resolve_tasks, spec_of, specs, task_names
 from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.metaworld.tasks import SUITES, TASKS

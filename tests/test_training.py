@@ -24,10 +24,9 @@ from kerv_cli.base.paths import RESUME
 from kerv_cli.methods.drafters import TrainableDrafter
 from kerv_cli.report.plots import save_curves
 from kerv_cli.targets.checkpoint import load_target, save_tensors
-from kerv_cli.targets.compact.folder import save_target
-from kerv_cli.targets.compact.settings import TargetSettings
-from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.compact.target import CompactTarget, save_target
 from kerv_cli.targets.losses import soft_labels, token_loss
+from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.training.fit import Metrics, Progress, Save, batches, fit, read_state
 from kerv_cli.training.settings import TrainSettings
 from kerv_cli.training.target import Imitation, lit, vocabulary, waypoints_of

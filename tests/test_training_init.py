@@ -18,9 +18,8 @@ from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.checkpoint import load_target, read_target
-from kerv_cli.targets.compact.folder import save_target
-from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.targets.compact.features import WordTokenizer
+from kerv_cli.targets.compact.target import CompactTarget, save_target
 from kerv_cli.training.demonstrations import PolicyActs, open_demos
 from kerv_cli.training.drafter import train_drafter
 from kerv_cli.training.fit import batches, identity_of

@@ -13,8 +13,8 @@ from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.spaces import Observation
-from kerv_cli.targets.compact.settings import TargetSettings
 from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.training.settings import TrainTargetSettings
 from kerv_cli.training.target import check_init, continued_target, vocabulary
 from kerv_cli.worlds.demos.dataset import DemoDataset

@@ -20,8 +20,8 @@ from kerv_cli.base.files import read_mapping
 from kerv_cli.base.paths import as_path, find_target
 from kerv_cli.bench.physics import INSTRUCTION, SHAPES, Shape, encoder_of, encoder_of_weights, openvla, vla_shape
 from kerv_cli.bench.settings import EstimateSettings
-from kerv_cli.targets.compact.settings import prompt_tokens
 from kerv_cli.targets.openvla.config import TOWERS, Language, Tower, read_shape
+from kerv_cli.targets.settings import prompt_tokens
 
 PUBLISHED = {
     "SmolLM2-135M": (0.135e9, 30, 49_152),

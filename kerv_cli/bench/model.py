@@ -21,11 +21,10 @@ from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import EagleDrafter, EagleNetwork
 from kerv_cli.methods.settings import PolicySettings
-from kerv_cli.targets.compact.compilable import compile_parts
-from kerv_cli.targets.compact.program import stored_bytes
-from kerv_cli.targets.compact.settings import TargetSettings
+from kerv_cli.targets.compact.program import compile_parts, stored_bytes
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import Layer
+from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.training.settings import TrainTargetSettings
 from kerv_cli.training.target import vocabulary
 from kerv_cli.worlds.metaworld.spec import SPEC

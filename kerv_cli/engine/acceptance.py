@@ -17,10 +17,6 @@ from kerv_cli.engine.tree import ROOT, TokenTree
 if TYPE_CHECKING:
     from kerv_cli.base.spaces import ActionSpace
 
-Bounds = Sequence[tuple[int, int]]
-"""For each DoF: the index of the first DoF of its kinematic group, and the index after the last one
-(`ActionSpace.bounds`)."""
-
 
 class Accepted(NamedTuple):
     """The draft nodes that an acceptance rule accepts, and the one it rejects.
@@ -35,19 +31,6 @@ class Accepted(NamedTuple):
     rejected: int | None
 
 
-def accept_by_distance(tree: TokenTree, target_tokens: Sequence[int], start: int, limits: Sequence[int]) -> Accepted:
-    """Return the longest path on which every token is close enough to the target token.
-
-    Args:
-        tree: The draft, n nodes.
-        target_tokens: The target's prediction after the last committed token, then after each of the n nodes.
-        start: Number of committed tokens. A node at depth d is token start + d of the chunk.
-        limits: Largest accepted distance per DoF, in bins. With all zeros, tokens must be equal.
-    """
-    alone = [(dof, dof + 1) for dof in range(len(limits))]  # every DoF is a group of its own
-    return accept_by_group(tree, target_tokens, start, limits, group_limit=max(limits), bounds=alone)
-
-
 def accept_by_group(
     tree: TokenTree,
     target_tokens: Sequence[int],
@@ -55,7 +38,7 @@ def accept_by_group(
     limits: Sequence[int],
     *,
     group_limit: int,
-    bounds: Bounds,
+    bounds: Sequence[tuple[int, int]],
 ) -> Accepted:
     """Return the longest path of whole kinematic groups, such as position or rotation (HeiSD's `sequence` rule).
 
@@ -73,7 +56,8 @@ def accept_by_group(
         start: Number of committed tokens. A node at depth d is token start + d of the chunk.
         limits: Largest accepted distance per DoF, in bins.
         group_limit: Largest accepted sum of a group's distances, in bins.
-        bounds: For each DoF, the index of the first DoF of its group and the index after the last one.
+        bounds: For each DoF, the index of the first DoF of its kinematic group and the index after the last one
+            (`ActionSpace.bounds`).
     """
     alive = [False] * len(tree)  # whether no limit is broken on the path to this node
     in_group = [0] * len(tree)  # distances summed within the node's group
@@ -143,7 +127,9 @@ class DistanceRule(Buildable):
             start: Number of committed tokens. A node at depth d is token start + d of the chunk.
             r: Acceptance radius, in bins.
         """
-        return accept_by_distance(tree, target_tokens, start, self.limits(r))
+        limits = self.limits(r)
+        alone = [(dof, dof + 1) for dof in range(len(limits))]  # every DoF is a group of its own
+        return accept_by_group(tree, target_tokens, start, limits, group_limit=max(limits), bounds=alone)
 
     def judge_after(self, tokens: Sequence[int], tree: TokenTree, target_tokens: Sequence[int], r: int) -> Accepted:
         """Return what `judge` returns. A rule that also reads the committed `tokens` overrides this."""

@@ -32,7 +32,7 @@ class BatchDecoder:
         """Take target and method from a decoder. `Method.check` tests whether the method can be batched."""
         self.decoder, self.target = decoder, decoder.target
         self.limits = decoder.acceptance.limits(decoder.threshold.radius())
-        self.skip = decoder.parts.skip
+        self.skip, self.size = decoder.parts.skip, decoder.target.actions.longest(decoder.steps)
         self._caches: dict[int, Cache] = {}
 
     def new_episode(self) -> Follower:
@@ -43,23 +43,25 @@ class BatchDecoder:
     def decode(self, episodes: Sequence[Follower], observations: Sequence[Observation]) -> list[DecodeRecord]:
         """Decode one observation per episode. Return one record per episode, with the actions to execute."""
         prompts = functools.cache(lambda: self._encode(observations))  # encoded only if some part reads a prompt
-
-        def prompt(i: int) -> Tensor:
-            return prompts()[i]
-
         steps, space, cache = self.decoder.steps, self.target.actions, self.decoder.cache
         chunks = []
         for i, episode in enumerate(episodes):
-            target = TargetSide(functools.partial(prompt, i), cache)
+            target = TargetSide(lambda i=i: prompts()[i], cache)  # type: ignore[misc]
             chunk = Chunk(steps, space, episode.situation, target, self.limits, observation=observations[i])
             if self.skip is not None:
                 cache.length = 0
                 chunk.take(self.skip.take(chunk))
             chunks.append(chunk)
-        verified = [chunk for chunk in chunks if chunk.remaining]
-        for chunk, tokens in zip(verified, self._tokens(verified), strict=True):
-            for token in chunk.until_end(tokens):
-                chunk.commit_token(token)
+        groups: dict[int, list[Chunk]] = {}  # chunks with equally long prompts are decoded together, unpadded
+        for chunk in chunks:
+            if chunk.remaining:
+                groups.setdefault(chunk.target.prompt_length, []).append(chunk)
+        for group in groups.values():
+            prompt = torch.cat([chunk.target.prompt for chunk in group])
+            decoded, _ = greedy(self.target, prompt, self._cache(len(group)), self.size)
+            for chunk, tokens in zip(group, decoded.tolist(), strict=True):
+                for token in chunk.until_end(tokens):
+                    chunk.commit_token(token)
         for chunk in chunks:
             chunk.situation.last[:] = chunk.tokens
         similarity = self.decoder.parts.similarity
@@ -74,23 +76,6 @@ class BatchDecoder:
             return list(self.target.encode_many(observations).split(1))
         return [self.target.encode(observation) for observation in observations]
 
-    def _tokens(self, chunks: Sequence[Chunk]) -> list[list[int]]:
-        """Decode N tokens per chunk greedily. Chunks with equally long prompts are decoded together, unpadded."""
-        groups: dict[int, list[int]] = {}
-        for i, chunk in enumerate(chunks):
-            groups.setdefault(chunk.target.prompt_length, []).append(i)
-        tokens: list[list[int]] = [[]] * len(chunks)
-        for group in groups.values():
-            prompt = torch.cat([chunks[i].target.prompt for i in group])
-            decoded, _ = greedy(self.target, prompt, self._cache(len(group)), self._size)
-            for i, row in zip(group, decoded.tolist(), strict=True):
-                tokens[i] = row
-        return tokens
-
-    @property
-    def _size(self) -> int:
-        return self.target.actions.longest(self.decoder.steps)
-
     def _cache(self, rows: int) -> Cache:
         """Return an empty cache for `rows` sequences.
 
@@ -98,7 +83,7 @@ class BatchDecoder:
         changes each time an episode ends, and keeping a cache for each number would fill the memory.
         """
         if rows not in self._caches:
-            self._caches = {rows: self.target.new_cache(rows, self.target.max_prompt + self._size)}
+            self._caches = {rows: self.target.new_cache(rows, self.target.max_prompt + self.size)}
         self._caches[rows].length = 0
         return self._caches[rows]
 

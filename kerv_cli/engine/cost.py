@@ -30,6 +30,8 @@ READ_PHASES = ("vision", "propose", "accept", "rectify", "other")
 """Phases whose recorded seconds the cost model reads. For `vision` it only reads whether they are zero."""
 
 
+Columns = Mapping[str, np.ndarray]
+"""An array per name."""
 COUNTED = ("mode", "proposer", "start", "tree_size", "accepted", "levels")
 """Attributes of `Round` that the cost model reads."""
 
@@ -152,7 +154,7 @@ class Work:
     """
 
     calls: Mapping[str, Calls]
-    sources: Mapping[str, np.ndarray]
+    sources: Columns
     host: np.ndarray
     propose: np.ndarray
 
@@ -162,13 +164,7 @@ class Work:
         return [*self.calls, *self.sources]
 
 
-def work_of(
-    rounds: Mapping[str, np.ndarray],
-    counts: np.ndarray,
-    phases: Mapping[str, np.ndarray],
-    looked_up: np.ndarray,
-    size: int,
-) -> Work:
+def work_of(rounds: Columns, counts: np.ndarray, phases: Columns, looked_up: np.ndarray, size: int) -> Work:
     """Return what several decodes computed, from the columns of their records.
 
     Args:

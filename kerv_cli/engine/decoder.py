@@ -137,7 +137,14 @@ class Decoder(ActionDecoder):
         ends.
         """
         stopwatch = Stopwatch(self.target.device)
-        chunk = self.decode_prompt(self._encoding(observation, stopwatch), stopwatch, observation)
+
+        def encode() -> Tensor:
+            stopwatch.lap("propose")  # time until now was spent by the part that reads the prompt first
+            prompt = self.target.encode(observation)
+            stopwatch.lap("vision")
+            return prompt
+
+        chunk = self.decode_prompt(encode, stopwatch, observation)
         actions = chunk.actions()
         self.situation.last[:] = chunk.tokens
         # a plugin's threshold need not have the attribute `measure`
@@ -151,15 +158,6 @@ class Decoder(ActionDecoder):
             return record
         autoregressive = self.autoregressive.decode(observation).actions
         return replace(record, deviation=deviation(self.space, actions, autoregressive))
-
-    def _encoding(self, observation: Observation, stopwatch: Stopwatch) -> Callable[[], Tensor]:
-        def encode() -> Tensor:
-            stopwatch.lap("propose")  # time until now was spent by the part that reads the prompt first
-            prompt = self.target.encode(observation)
-            stopwatch.lap("vision")
-            return prompt
-
-        return encode
 
     @torch.inference_mode()
     def decode_prompt(

@@ -65,16 +65,15 @@ class Draft:
             KervError: A token is out of range, a path is too long, a tree on the GPU has no `levels`, or tokens and
                 parents are on different devices.
         """
-        device, is_chain = self.tokens.device, self.parents is None
-        if self.parents is not None and self.parents.device != device:
-            raise KervError(
-                f"the proposer '{proposer}' drafted tokens on {device} and parents on {self.parents.device}: put both "
-                "on one device"
-            )
+        device, reached = self.tokens.device, len(self)
         if device == HOST:
             check_tokens(self.tokens.numpy(), vocabulary, proposer)
-        reached = len(self)
-        if not is_chain:
+        if self.parents is not None:
+            if self.parents.device != device:
+                raise KervError(
+                    f"the proposer '{proposer}' drafted tokens on {device} and parents on {self.parents.device}: put "
+                    "both on one device"
+                )
             reached = max(self.tree.depths, default=-1) + 1 if device == HOST else self.levels
             if len(self) and not reached:
                 raise KervError(f"the proposer '{proposer}' drafted a tree on {device} without Draft.levels")

@@ -14,6 +14,10 @@ from torch import Tensor, nn
 
 from kerv_cli.base.spaces import ActionSpace, Observation
 
+Seen = np.ndarray | Tensor | None
+"""Attention mask (T, M) bool: which of the last M tokens, old or new, each of T new tokens attends to. None: attention
+is causal. A target on a GPU may get a tensor instead of an array."""
+
 
 class Cache(Protocol):
     """Keys and values of the tokens that the target has processed, one token per slot.
@@ -37,27 +41,23 @@ class Cache(Protocol):
 
 
 class Target(Protocol):
-    """A policy that decodes actions as tokens and verifies drafts."""
+    """A policy that decodes actions as tokens and verifies drafts.
 
-    @property
-    def actions(self) -> ActionSpace:
-        """Action space: the DoFs, their limits, and the normalisation that the policy was trained with."""
+    Attributes:
+        actions: Action space: the DoFs, their limits, and the normalisation that the policy was trained with.
+        chunk: Number of control steps H in a chunk that the policy was trained on.
+        width: Width E of the embeddings and hidden states.
+        max_prompt: Largest prompt length P, in tokens, that `encode` can return.
+    """
 
-    @property
-    def chunk(self) -> int:
-        """Number of control steps H in a chunk that the policy was trained on."""
+    actions: ActionSpace
+    chunk: int
+    width: int
+    max_prompt: int
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """Names of the cameras whose images `encode` reads. No other camera is rendered."""
-
-    @property
-    def width(self) -> int:
-        """Width E of the embeddings and hidden states."""
-
-    @property
-    def max_prompt(self) -> int:
-        """Largest prompt length P, in tokens, that `encode` can return."""
 
     @property
     def device(self) -> torch.device:
@@ -80,9 +80,7 @@ class Target(Protocol):
             capacity: Number of tokens that fit into each sequence.
         """
 
-    def forward(
-        self, x: Tensor, positions: Tensor, cache: Any = None, seen: np.ndarray | Tensor | None = None
-    ) -> Tensor:
+    def forward(self, x: Tensor, positions: Tensor, cache: Any = None, seen: Seen = None) -> Tensor:
         """Process T new tokens that follow the cached ones, and return their hidden states (B, T, E).
 
         Args:
@@ -90,8 +88,7 @@ class Target(Protocol):
             positions: Position of each new token in the sequence (T,), for the positional encoding.
             cache: From `new_cache`. The new tokens attend to all cached tokens and are added to the cache. None: there
                 are no earlier tokens.
-            seen: Attention mask (T, T) bool: whether new token i attends to new token j. None: attention is causal. A
-                target on a GPU may get a tensor instead of an array.
+            seen: Attention mask (T, T) bool: whether new token i attends to new token j. None: attention is causal.
         """
 
     def head(self, hidden: Tensor) -> Tensor:
@@ -128,9 +125,7 @@ class ContinuesGreedily(Protocol):
 class PredictsTokens(Protocol):
     """A target that predicts the next tokens in one call, faster than with `embed`, `forward` and `head`."""
 
-    def predict(
-        self, tokens: Tensor, positions: Tensor, cache: Any, seen: np.ndarray | Tensor | None
-    ) -> tuple[Tensor, Tensor]:
+    def predict(self, tokens: Tensor, positions: Tensor, cache: Any, seen: Seen) -> tuple[Tensor, Tensor]:
         """Process T new tokens that follow the cached ones.
 
         Args:
@@ -169,23 +164,19 @@ class JoinsDrafters(Protocol):
 
 
 class ReadableTarget(Target, Protocol):
-    """A target that also describes its prompt and the shape of its layers, for drafters and the datastore."""
+    """A target that also describes its prompt and the shape of its layers, for drafters and the datastore.
 
-    @property
-    def segments(self) -> Mapping[str, slice]:
-        """Map from the name of each part of the prompt, such as `vision`, to the positions of its tokens (a slice)."""
+    Attributes:
+        segments: Map from the name of each part of the prompt, such as `vision`, to the positions of its tokens.
+        pooled_width: Length F of the vectors that `pooled` returns.
+        heads: Number of attention heads in each layer.
+        feed_forward: Hidden width of each layer's feed-forward network.
+    """
 
-    @property
-    def pooled_width(self) -> int:
-        """Length F of the vectors that `pooled` returns."""
-
-    @property
-    def heads(self) -> int:
-        """Number of attention heads in each layer."""
-
-    @property
-    def feed_forward(self) -> int:
-        """Hidden width of each layer's feed-forward network."""
+    segments: Mapping[str, slice]
+    pooled_width: int
+    heads: int
+    feed_forward: int
 
     @property
     def layers(self) -> nn.ModuleList:
@@ -203,11 +194,13 @@ class ReadableTarget(Target, Protocol):
 
 
 class ParallelTarget(Target, Protocol):
-    """A target that decodes all N tokens of a chunk at once. It cannot decode token by token."""
+    """A target that decodes all N tokens of a chunk at once. It cannot decode token by token.
 
-    @property
-    def parallel(self) -> bool:
-        """Always True. It marks the target as parallel."""
+    Attributes:
+        parallel: Always True. It marks the target as parallel.
+    """
+
+    parallel: bool
 
     def parallel_pass(self, prompt: Tensor, cache: Any = None) -> Tensor:
         """Return the hidden states (B, N, E) that predict the chunk's N tokens, from one forward.

@@ -18,7 +18,7 @@ from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.artifacts import Artifact, Artifacts, MadeFor, removal
 from kerv_cli.methods.context import Context
 from kerv_cli.targets import checkpoint
-from kerv_cli.targets.compact.compilable import load_compiled
+from kerv_cli.targets.compact.program import load_compiled
 from kerv_cli.targets.observations import Rows, observed_steps, split
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.files import DemoEpisode

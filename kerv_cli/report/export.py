@@ -21,7 +21,7 @@ from kerv_cli.lab.database import Database
 from kerv_cli.lab.store import Study
 from kerv_cli.report.reprice import levels_of
 from kerv_cli.report.results import csv_text
-from kerv_cli.targets.compact.settings import prompt_tokens
+from kerv_cli.targets.settings import prompt_tokens
 
 FORMATS = ("csv", "parquet", "db", "trace")
 _TRACED = ("rounds", "similarity", *(f"seconds.{phase}" for phase in READ_PHASES))  # columns of a trace

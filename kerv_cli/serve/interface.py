@@ -17,7 +17,9 @@ from typing import Any
 import numpy as np
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
+from kerv_cli.base.spaces import Observation
+from kerv_cli.targets.checkpoint import TargetDescription
+from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.views import frame_shape
 
 LARGEST = 4096
@@ -29,9 +31,16 @@ LIBERO's simulator needs the inverted convention.
 """
 
 
-@dataclass(frozen=True)
+@dataclass
 class Interface:
     """What a policy reads and sends.
+
+    Args:
+        description: Description of the policy.
+        spec: The policy's environment. None if kerv does not know it.
+        gripper: How the gripper's value (0 closed to 1 open) is sent: `as_is`, `signed` (-1 closed, 1 open) or
+            `signed_inverted` (1 closed, -1 open).
+        images_alone: Whether the policy reads images of any size and no state. A message may then leave out the state.
 
     Attributes:
         actions: Action space of the policy.
@@ -41,21 +50,21 @@ class Interface:
         cameras: Names of the images that the policy reads.
         size: Side of an image in pixels. 0 if the policy reads no images.
         privileged: Whether the policy reads the whole simulator state, not only proprioception.
-        images_alone: Whether the policy reads images of any size and no state. A message may then leave out the state.
-        gripper: How the gripper's value (0 closed to 1 open) is sent: `as_is`, `signed` (-1 closed, 1 open) or
-            `signed_inverted` (1 closed, -1 open).
         grip: Two values of the gripper in the environment's actions: closing, then opening. Empty if unknown.
     """
 
-    actions: ActionSpace
-    space: ActionSpace
-    observation: ObservationSpace
-    cameras: tuple[str, ...]
-    size: int
-    privileged: bool
-    images_alone: bool
+    description: TargetDescription
+    spec: EnvironmentSpec | None
     gripper: str
-    grip: tuple[float, ...]
+    images_alone: bool
+
+    def __post_init__(self) -> None:
+        policy = self.description
+        self.actions, self.observation, self.cameras = policy.actions, policy.observation, policy.cameras
+        self.size = int(policy.settings.get("image_size", 0)) if policy.cameras else 0
+        self.privileged = not policy.cameras and policy.observation.state > 0
+        self.space = self.spec.actions if self.spec else policy.actions
+        self.grip = self.spec.grip if self.spec else ()
 
     def image(self, image: object, camera: str, key: str) -> np.ndarray:
         """Check an image that a client sent, and return it.

@@ -15,28 +15,20 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import Observation
 from kerv_cli.report.tally import Tally
 from kerv_cli.serve.interface import Interface, Message, hand_of, keys_of, packed, text_of, unpacked
-from kerv_cli.serve.policy import Conversation, Log, Policy
+from kerv_cli.serve.policy import Conversation, Policy
 
 STATE, IMAGE, PROMPT, RESET, EXECUTED = "observation/state", "observation/image", "prompt", "reset", "executed"
 
 
 def metadata(policy: Policy) -> dict[str, object]:
     """Return what the server tells a new client about the policy: cameras, state, actions, limits and chunk length."""
-    interface = policy.interface
-    return {
-        "server": "kerv",
-        "policy": policy.settings.policy.target,
-        "method": policy.settings.method,
-        "cameras": list(interface.cameras),
-        "image_size": interface.size,
-        "state": list(interface.observation.proprioception),
-        "actions": list(interface.actions.names),
-        "low": list(interface.actions.low),
-        "high": list(interface.actions.high),
-        "control_hz": interface.actions.control_hz,
-        "chunk": policy.chunk,
-        "gripper": interface.gripper,
-    }
+    interface, actions = policy.interface, policy.interface.actions
+    about = {"server": "kerv", "policy": policy.settings.policy.target, "method": policy.settings.method}
+    images = {"cameras": list(interface.cameras), "image_size": interface.size}
+    state = {"state": list(interface.observation.proprioception)}
+    limits = {"actions": list(actions.names), "low": list(actions.low), "high": list(actions.high)}
+    timing = {"control_hz": actions.control_hz, "chunk": policy.chunk, "gripper": interface.gripper}
+    return {**about, **images, **state, **limits, **timing}
 
 
 def observation_of(interface: Interface, message: Message) -> Observation:
@@ -68,8 +60,8 @@ class OpenPi(Conversation):
 
     seats, ping_s, idle_s = 1, 10.0, 120.0
 
-    def __init__(self, policy: Policy, log: Log = lambda line: None) -> None:
-        super().__init__(policy, log)
+    def __init__(self, policy: Policy) -> None:
+        super().__init__(policy)
         self.last, self.last_hand = np.zeros((0, 0)), np.zeros(3)
         self.decodes = 0
         self.tally = Tally.of_records((), self.interface.actions.kinds)
@@ -109,19 +101,18 @@ class OpenPi(Conversation):
         else:
             for step, action in enumerate(executed, 1):
                 self.decoder.observe(action, self.last_hand + (hand - self.last_hand) * step / len(executed))
-        self.policy.range.check(observation)
+        self.policy.check_range(observation)
         record = self.policy.decode(self.decoder, observation)
         self.last, self.last_hand = record.actions, hand
         self.decodes += 1
         self.tally += Tally.of_records((record,), self.interface.actions.kinds)
-        timing = {"infer_ms": 1000 * record.seconds}
-        return {
-            "actions": self.interface.converted(record.actions),
-            "policy_timing": timing,
-            "decode": {"forwards": record.forwards, "tokens": len(record.tokens), "mode": record.mode},
-            **({"spec_decode": self.tally.as_dict()} if self.tally.drafts else {}),
-            "server_timing": timing | ({} if math.isnan(self.last_ms) else {"prev_total_ms": self.last_ms}),
-        }
+        answer: dict[str, Any] = {"actions": self.interface.converted(record.actions)}
+        answer["policy_timing"] = timing = {"infer_ms": 1000 * record.seconds}
+        answer["decode"] = {"forwards": record.forwards, "tokens": len(record.tokens), "mode": record.mode}
+        if self.tally.drafts:
+            answer["spec_decode"] = self.tally.as_dict()
+        before = {} if math.isnan(self.last_ms) else {"prev_total_ms": self.last_ms}
+        return {**answer, "server_timing": timing | before}
 
     def fault(self, line: str) -> str:
         """Return the message that tells the client about an error. `line` is the error's text."""

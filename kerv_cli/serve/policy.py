@@ -5,7 +5,6 @@ from __future__ import annotations
 import abc
 import math
 import threading
-from collections.abc import Callable
 from dataclasses import asdict, fields
 from typing import Any
 
@@ -29,12 +28,13 @@ from kerv_cli.serve.settings import ServeSettings
 from kerv_cli.targets import TargetPart
 from kerv_cli.targets.provenance import stamp
 from kerv_cli.worlds import specs
-from kerv_cli.worlds.spec import EnvironmentSpec
 
 VLA_EVAL = "vla_eval"
 """The protocol in which clients name the task of every episode."""
 WARM_UP = 4
 """Number of decodes before a new decoder serves. The first calls are slow: they allocate memory and choose kernels."""
+LEAST_WIDTH = 1.0
+"""Width assumed for the range of a number that hardly varied in the demonstrations, in the number's own unit."""
 
 
 class Policy:
@@ -46,7 +46,9 @@ class Policy:
         chunk: H, number of control steps in an answer.
         by_task: Whether a decoder depends on the task, because the method's calibrated values or drafts do. Clients
             then name the task.
-        range: The range of states on which the policy may act.
+        low: (p,) smallest states on which the policy may act: the range of its demonstrations plus a margin. Empty if
+            the checkpoint stores no range, or if the policy reads no state.
+        high: (p,) largest states on which the policy may act.
 
     Raises:
         UnknownName: The policy's environment has no task with that name.
@@ -59,75 +61,62 @@ class Policy:
             raise UsageError(f"policy={settings.policy.kind}: it needs the simulator and cannot be served")
         self.settings = settings
         self.artifacts = artifacts_of(settings)
-        self.description = self.artifacts.description
-        spec, name = specs().get(self.description.environment), settings.task_name
+        self.description = description = self.artifacts.description
+        spec, name = specs().get(description.environment), settings.task_name
         self.task = spec.task(name).name if spec and name else name
         self.method = Method.of(settings)
-        self.method.check(self.description)
-        use = Use(self.method.settings, settings.runtime.dtype, self.description.environment)
+        self.method.check(description)
+        use = Use(self.method.settings, settings.runtime.dtype, description.environment)
         self.identity = self.artifacts.check(self.method.needs, use)
-        self.interface = self._interface(spec)
-        self.range = self._range()
-        self.by_task = not self.task and bool(self._by_task())
-        if self.by_task and settings.protocol != VLA_EVAL and any(part.needs_task for part in self._by_task()):
+        images_alone = TargetPart.find(description.family).images_alone
+        self.interface = Interface(description, spec, settings.gripper, images_alone)
+        stored = ((), ()) if images_alone else description.state_range or ((), ())
+        count = None if self.interface.privileged else len(description.observation.proprioception)
+        low, high = np.array(stored)[:, :count]
+        margin = settings.margin * np.where(high - low < LEAST_WIDTH / 100, LEAST_WIDTH, high - low)
+        self.low, self.high = low - margin, high + margin
+        parts = [part for kind in sorted(self.method.needs) if (part := ArtifactPart.find(kind)).by_task]
+        self.by_task, task = not self.task and bool(parts), self.task
+        if self.by_task and settings.protocol == VLA_EVAL:  # warm up with any task for which the method was calibrated
+            task = next(iter(self.artifacts.load(parts[0].name).tasks), "")
+        elif self.by_task and any(part.needs_task for part in parts):
             raise UsageError(
                 f"method={settings.method}: its calibration or drafts differ between tasks: name one with task=NAME"
             )
         self._turn = threading.Lock()
-        first = self._new_decoder(self._any_task())
+        self._idle: list[Decoder] = []
+        first = self.lend_decoder(task)
         self.chunk = first.steps
-        self._idle: list[Decoder] = [] if self.by_task else [first]
-
-    def _interface(self, spec: EnvironmentSpec | None) -> Interface:
-        """Return what the policy reads and sends."""
-        description = self.description
-        return Interface(
-            actions=description.actions,
-            space=spec.actions if spec else description.actions,
-            observation=description.observation,
-            cameras=tuple(description.cameras),
-            size=int(description.settings.get("image_size", 0)) if description.cameras else 0,
-            privileged=not description.cameras and description.observation.state > 0,
-            images_alone=TargetPart.find(description.family).images_alone,
-            gripper=self.settings.gripper,
-            grip=tuple(spec.grip) if spec else (),
-        )
-
-    def _range(self) -> StateRange:
-        """Return the range of states on which the policy may act.
-
-        The range is unlimited if the policy's checkpoint stores none, or if the policy reads no state.
-        """
-        stored, interface = self.description.state_range, self.interface
-        names = interface.observation.proprioception
-        if stored is None or interface.images_alone:
-            stored = ((), ())
-        low, high = (np.array(ends)[: None if interface.privileged else len(names)] for ends in stored)
-        return StateRange(low, high, names, self.settings.margin)
-
-    def _by_task(self) -> list[ArtifactPart]:
-        """Return the kinds of the method's artifacts that contain numbers or data for each task."""
-        parts = [ArtifactPart.find(kind) for kind in sorted(self.method.needs)]
-        return [part for part in parts if part.by_task]
-
-    def _any_task(self) -> str:
-        """Return a task with which a decoder can be built, for warming up.
-
-        It is the task in the settings, or any task for which the method was calibrated.
-        """
-        if not self.by_task or self.settings.protocol != VLA_EVAL:
-            return self.task
-        artifact = self.artifacts.load(self._by_task()[0].name)
-        return next(iter(artifact.tasks), "")
+        self.take_back(first)
 
     def lend_decoder(self, task: str) -> Decoder:
-        """Return a decoder for a new client."""
-        return self._idle.pop() if self._idle else self._new_decoder(task)
+        """Return a decoder for a new client. A new decoder is warmed up."""
+        if self._idle:
+            return self._idle.pop()
+        with self._turn:
+            decoder = self.method.decoder(self.artifacts.target, self.artifacts.load, task)
+            decoder.target = Finite(decoder.target)
+            warm_up(decoder, task, self.interface.observation, self.interface.size, WARM_UP)
+        return decoder
 
     def take_back(self, decoder: Decoder) -> None:
         """Keep a client's decoder for the next client. A decoder that depends on the task is dropped."""
         if not self.by_task:
             self._idle.append(decoder)
+
+    def check_range(self, observation: Observation) -> None:
+        """Check that the policy may act on a state.
+
+        Raises:
+            UsageError: A number of the state is out of range. The message names the first one.
+        """
+        numbers, names = observation.state[: len(self.low)], self.interface.observation.proprioception
+        for first in np.flatnonzero((numbers < self.low) | (numbers > self.high)).tolist():
+            name = names[first] if first < len(names) else f"number {first}"
+            raise UsageError(
+                f"the state is out of range: {name} is {numbers[first]:.4g}, the policy was trained on "
+                f"{self.low[first]:.4g} to {self.high[first]:.4g}, margin included"
+            )
 
     def decode(self, decoder: Decoder, observation: Observation) -> DecodeRecord:
         """Decode the observation of one client. Calls from several threads wait for each other.
@@ -145,14 +134,6 @@ class Policy:
             target.check()
         return record
 
-    def _new_decoder(self, task: str) -> Decoder:
-        """Build a decoder and warm it up."""
-        with self._turn:
-            decoder = self.method.decoder(self.artifacts.target, self.artifacts.load, task)
-            decoder.target = Finite(decoder.target)
-            warm_up(decoder, task, self.interface.observation, self.interface.size, WARM_UP)
-        return decoder
-
     def facts(self) -> dict[str, object]:
         """Return what is stored with each served episode: settings, hashes of the policy's files, and the machine."""
         shared = {setting.name: getattr(self.settings, setting.name) for setting in fields(MethodSettings)}
@@ -161,39 +142,6 @@ class Policy:
         if self.interface.size:
             settings["world"]["camera"] |= {"name": self.interface.cameras[0], "size": self.interface.size}
         return {"settings": settings, "identity": self.identity, "machine": stamp(self.artifacts.device)}
-
-
-LEAST_WIDTH = 1.0
-"""Width assumed for the range of a number that hardly varied in the demonstrations, in the number's own unit."""
-
-
-class StateRange:
-    """The states on which a policy may act: the range of its demonstrations plus a margin.
-
-    Args:
-        low: (p,) lower ends of the demonstrations' range.
-        high: (p,) upper ends.
-        names: Names of the first numbers of the state, for error messages.
-        margin: How much to add on each side, as a multiple of the range's width.
-    """
-
-    def __init__(self, low: np.ndarray, high: np.ndarray, names: tuple[str, ...], margin: float) -> None:
-        added = margin * np.where(high - low < LEAST_WIDTH / 100, LEAST_WIDTH, high - low)
-        self.low, self.high, self.names = low - added, high + added, names
-
-    def check(self, observation: Observation) -> None:
-        """Check that a state is in the range.
-
-        Raises:
-            UsageError: A number of the state is out of range. The message names the first one.
-        """
-        numbers = observation.state[: len(self.low)]
-        for first in np.flatnonzero((numbers < self.low) | (numbers > self.high)).tolist():
-            name = self.names[first] if first < len(self.names) else f"number {first}"
-            raise UsageError(
-                f"the state is out of range: {name} is {numbers[first]:.4g}, the policy was trained on "
-                f"{self.low[first]:.4g} to {self.high[first]:.4g}, margin included"
-            )
 
 
 class Finite:
@@ -226,9 +174,6 @@ class Finite:
             raise KervError("the policy computed numbers that are not finite: no action is sent")
 
 
-Log = Callable[[str], None]
-
-
 class Conversation(abc.ABC):
     """One client's connection: its decoder and its episodes. Each protocol is a subclass.
 
@@ -245,8 +190,8 @@ class Conversation(abc.ABC):
     ping_s: float | None
     idle_s: float
 
-    def __init__(self, policy: Policy, log: Log = lambda line: None) -> None:
-        self.policy, self.interface, self.log = policy, policy.interface, log
+    def __init__(self, policy: Policy) -> None:
+        self.policy, self.interface = policy, policy.interface
         self.task, self.last_ms = policy.task, math.nan
         self.decoder: Any = None if policy.by_task else policy.lend_decoder(self.task)
 

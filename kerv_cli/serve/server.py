@@ -18,7 +18,7 @@ import numpy as np
 
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.registry import load
-from kerv_cli.serve.policy import Conversation, Log, Policy
+from kerv_cli.serve.policy import Conversation, Policy
 from kerv_cli.serve.settings import ServeSettings
 
 try:
@@ -54,7 +54,7 @@ class PolicyServer:
         log: Called with every line of the log.
     """
 
-    def __init__(self, policy: Policy, settings: ServeSettings, log: Log) -> None:
+    def __init__(self, policy: Policy, settings: ServeSettings, log: Callable[[str], None]) -> None:
         self.policy, self.settings, self.log = policy, settings, log
         self.protocol: type[Conversation] = load(PROTOCOLS[settings.protocol])
         self._seats = threading.BoundedSemaphore(self.protocol.seats)
@@ -131,7 +131,7 @@ class PolicyServer:
             self.log(f"{who} disconnected{why}; {_summary(times)}")
 
     def _talk(self, connection: ServerConnection, who: str, times: list[float]) -> None:
-        """Answer messages until the connection ends.
+        """Answer messages until the connection ends. A message that cannot be answered gets one that says why.
 
         Args:
             connection: The connection.
@@ -142,27 +142,23 @@ class PolicyServer:
             ConnectionClosed: The client has left.
             TimeoutError: The client was silent for too long.
         """
-        protocol = self.protocol(self.policy, lambda line: self.log(f"{who} {line}"))
-        with contextlib.closing(protocol) as conversation:
+        with contextlib.closing(self.protocol(self.policy)) as conversation:
             if (greeting := conversation.greeting()) is not None:
                 connection.send(greeting)
             while True:
                 frame, began = connection.recv(timeout=self.protocol.idle_s), time.perf_counter()
-                answer = self._answer(conversation, frame)
+                answer: bytes | str | None
+                try:
+                    answer = conversation.answer(frame)
+                except Exception as error:  # noqa: BLE001 - whatever a client sends, the server goes on
+                    internal = f"internal error, {type(error).__name__}: {str(error)[:200]}"
+                    line = " ".join((str(error) if isinstance(error, KervError) else internal).split())[:LONGEST]
+                    self.log(f"{who} error: {line}")
+                    answer = conversation.fault(line)
                 if answer is not None:
                     connection.send(answer)
                     conversation.last_ms = 1000 * (time.perf_counter() - began)
                     times.append(conversation.last_ms)
-
-    def _answer(self, conversation: Conversation, frame: bytes | str) -> bytes | str | None:
-        """Return the answer to a message, or a message that says what is wrong, which is also logged."""
-        try:
-            return conversation.answer(frame)
-        except Exception as error:  # noqa: BLE001 - whatever a client sends, the server goes on
-            internal = f"internal error, {type(error).__name__}: {str(error)[:200]}"
-            line = " ".join((str(error) if isinstance(error, KervError) else internal).split())[:LONGEST]
-            conversation.log(f"error: {line}")
-            return conversation.fault(line)
 
 
 def _start(function: Callable[..., object], *arguments: object) -> None:
@@ -186,7 +182,7 @@ def _address(connection: ServerConnection) -> str:
         return "a client that has left"
 
 
-def _one_line_logger(log: Log) -> logging.Logger:
+def _one_line_logger(log: Callable[[str], None]) -> logging.Logger:
     """Return a logger for websockets that writes each error as one line without a traceback."""
 
     class Lines(logging.Handler):

@@ -21,7 +21,7 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.catalogue.evaluations import path_of, write_served
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
 from kerv_cli.serve.interface import OPEN, Interface, Message, hand_of, keys_of, packed, text_of, unpacked
-from kerv_cli.serve.policy import Conversation, Log, Policy
+from kerv_cli.serve.policy import Conversation, Policy
 
 PROTOCOL_VERSION = 1
 MOST_STEPS = 20_000
@@ -96,8 +96,8 @@ class VlaEval(Conversation):
 
     seats, ping_s, idle_s = 64, None, 1800.0
 
-    def __init__(self, policy: Policy, log: Log = lambda line: None) -> None:
-        super().__init__(policy, log)
+    def __init__(self, policy: Policy) -> None:
+        super().__init__(policy)
         self.episode: _Episode | None = None
         self.sequence = 0
 
@@ -134,16 +134,10 @@ class VlaEval(Conversation):
             raise UsageError(
                 f"protocol version {str(number)[:20]} is unknown: this server speaks version {PROTOCOL_VERSION}"
             )
-        params = observation_params(self.interface)
-        about = {
-            "harness_version": f"kerv {version('kerv')}",
-            "protocol_version": PROTOCOL_VERSION,
-            "model_server": "kerv",
-            "capabilities": {},
-            **dim_specs(self.interface),
-            "kerv": self.policy.facts(),
-            **({"observation_params": params} if params else {}),
-        }
+        about: dict[str, object] = {"harness_version": f"kerv {version('kerv')}", "protocol_version": PROTOCOL_VERSION}
+        about |= {"model_server": "kerv", "capabilities": {}, "kerv": self.policy.facts(), **dim_specs(self.interface)}
+        if params := observation_params(self.interface):
+            about["observation_params"] = params
         return self._message("hello", about)
 
     def _start(self, payload: Message) -> None:
@@ -151,7 +145,7 @@ class VlaEval(Conversation):
 
         The decoder is built at the first observation. Errors in `payload` are reported only then.
         """
-        self.episode = _Episode(payload)  # errors are reported at the first observation
+        self.episode = _Episode(payload)
 
     def _observe(self, payload: Message) -> bytes:
         """Return the next action. If the last chunk is used up, decode this observation first.
@@ -171,7 +165,7 @@ class VlaEval(Conversation):
         elif step == len(episode.path):
             self.decoder.observe(episode.sent[-1], hand)
         episode.path[step:] = [hand]  # replace the position that a failed observation of this step left
-        self.policy.range.check(state)
+        self.policy.check_range(state)
         if not episode.left:
             record = self.policy.decode(self.decoder, self._observation(episode, payload, numbers))
             episode.decodes.append(record)

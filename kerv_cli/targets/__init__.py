@@ -29,8 +29,8 @@ class TargetPart(Part):
 
 @TargetPart("compact")
 def compact(*arguments: Any) -> Any:
-    """Load a compact target; see `compact.folder.build`."""
-    from kerv_cli.targets.compact.folder import build
+    """Load a compact target; see `compact.target.build`."""
+    from kerv_cli.targets.compact.target import build
 
     return build(*arguments)
 

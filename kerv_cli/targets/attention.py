@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from kerv_cli.engine.protocol import Seen
 from kerv_cli.engine.transfer import upload
 
 
@@ -89,11 +90,13 @@ class Cache:
         return torch.arange(start, stop, device=self.buffer.device) if self.fixed else slice(start, stop)
 
 
-Slots = slice | Tensor
-"""Slots of a cache that a forward writes: a slice, or for a cache of fixed shapes indices (T,)."""
+Slots = slice | Tensor | None
+"""Slots of a cache that a forward writes: a slice, or for a cache of fixed shapes indices (T,). None: no cache."""
+Rotation = tuple[Tensor, Tensor]
+"""Cosines and sines of the rotary embedding at the positions of T tokens, see `rotate`."""
 
 
-def attend(q: Tensor, k: Tensor, v: Tensor, cache: Tensor | None, slots: Slots | None, mask: Tensor | None) -> Tensor:
+def attend(q: Tensor, k: Tensor, v: Tensor, cache: Tensor | None, slots: Slots, mask: Tensor | None) -> Tensor:
     """Return the attention's result (B, T, A · C) of new tokens, and write their keys and values to the cache.
 
     Args:
@@ -119,7 +122,7 @@ def attend(q: Tensor, k: Tensor, v: Tensor, cache: Tensor | None, slots: Slots |
     return attended.transpose(1, 2).flatten(2)
 
 
-def attention_mask(seen: np.ndarray | Tensor | None, tokens: int, cache: Cache | None, like: Tensor) -> Tensor | None:
+def attention_mask(seen: Seen, tokens: int, cache: Cache | None, like: Tensor) -> Tensor | None:
     """Return the additive attention mask of new tokens: 0 for visible tokens, -inf for hidden tokens.
 
     Args:
@@ -228,19 +231,18 @@ class _Step:
         self.index = torch.full((size,), slots - 1, dtype=torch.long, device=like.device)
         self.mask = like.new_full((size, slots), -torch.inf)
         self.mask[:, -1] = 0.0  # a row that attends to nothing would be NaN, which would spread to all others
-        self.graph = self._captured() if like.is_cuda else None
-
-    def _captured(self) -> torch.cuda.CUDAGraph:
+        self.graph: torch.cuda.CUDAGraph | None = None
+        if not like.is_cuda:
+            return
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):
             for _ in range(_WARM_UP):
                 self._compute()
         torch.cuda.current_stream().wait_stream(stream)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
+        self.graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(self.graph):
             self.out = self._compute()
-        return graph
 
     def _compute(self) -> Tensor:
         return self.compute(self.x, self.positions, self.cache, self.index, self.mask)

@@ -5,7 +5,6 @@ The description contains settings, action and observation space, vocabulary and 
 
 from __future__ import annotations
 
-import functools
 import os
 import shutil
 from collections.abc import Mapping
@@ -301,9 +300,10 @@ def described(folder: Path, kind: str, schema: type[T]) -> T:
     path = folder / f"{kind}.json"
     if not path.is_file():
         raise CheckpointError(f"no {kind} in {folder}: run 'kerv train {kind}', or name a folder that holds one")
-    status = path.stat()
-    version = status.st_ino, status.st_size, status.st_mtime_ns
-    return _read_description(path, kind, schema, version)  # type: ignore[arg-type]
+    value = read_mapping(path)
+    if (value.get("format"), value.get("kind")) != (FORMAT, kind):
+        raise CheckpointError(f"{path} is not a {kind} of format {FORMAT}: it was written by another version of kerv")
+    return read(schema, value, str(path), tolerant=True)
 
 
 def check_weights(folder: Path, kind: str, sha256: str) -> None:
@@ -322,15 +322,6 @@ def check_weights(folder: Path, kind: str, sha256: str) -> None:
         raise CheckpointError(f"{weights} is missing: the {kind} is incomplete, train or copy it again")
     if sha256_of(weights) != sha256:
         raise CheckpointError(f"{weights} does not match its description: damaged or mixed up, copy the folder again")
-
-
-@functools.lru_cache(maxsize=256)
-def _read_description(path: Path, kind: str, schema: type[T], version: tuple[int, int, int]) -> T:
-    """Read a description. The result is cached until the file's `version` (inode, size, time of change) changes."""
-    value = read_mapping(path)
-    if (value.get("format"), value.get("kind")) != (FORMAT, kind):
-        raise CheckpointError(f"{path} is not a {kind} of format {FORMAT}: it was written by another version of kerv")
-    return read(schema, value, str(path), tolerant=True)
 
 
 def load_state(module: nn.Module, folder: Path, kind: str) -> None:

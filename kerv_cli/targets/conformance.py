@@ -12,6 +12,7 @@ import functools
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -60,7 +61,7 @@ class Trial:
     def __init__(self, target: Target, observation: Observation) -> None:
         self.target, self.observation = target, observation
 
-    def compare(self, fault: str, check: Callable[[Trial], Pairs]) -> str:
+    def compare(self, fault: str, check: Callable[[Trial], Pairs | None]) -> str:
         """Run a check, which yields pairs of hidden states, and compare the logits within each pair.
 
         Args:
@@ -71,7 +72,7 @@ class Trial:
             Text with the largest difference of two logits, in standard deviations of the logits.
         """
         worst = 0.0
-        for hidden, expected in check(self):
+        for hidden, expected in check(self) or ():
             a, b = self.target.head(hidden).double(), self.target.head(expected).double()
             gap = float((a - b).abs().max() / b.std().clamp_min(1e-9))
             allowed = gap <= TOLERANCE.get(self.prompt.dtype, 2e-4)
@@ -79,17 +80,16 @@ class Trial:
             worst = max(worst, gap)
         return f"logits within {worst:.1g} of their spread" if worst else "as declared"
 
-    def members(self) -> Pairs:
+    def members(self) -> None:
         """Check that the target has all required attributes and methods."""
         missing = [name for name in (*MEMBERS, *METHODS) if not hasattr(self.target, name)]
         need(not missing, f"{type(self.target).__name__} lacks {', '.join(missing)} (kerv_cli/engine/protocol.py)")
         need(not isinstance(self.target.cameras, str), "cameras is a text, must be a tuple of names")
         count = self.target.actions.tokens
-        self.tokens = [31 * i % count for i in range(9)]
-        self.drafted = [(17 * i + 5) % count for i in range(len(TREE))]
-        return ()
+        self.tokens = (31 * np.arange(9) % count).tolist()
+        self.drafted = ((17 * np.arange(len(TREE)) + 5) % count).tolist()
 
-    def encode(self) -> Pairs:
+    def encode(self) -> None:
         """Check that a prompt has the right shape and finite numbers, and is the same in a second encoding."""
         prompt, width, longest = self.target.encode(self.observation), self.target.width, self.target.max_prompt
         right = prompt.ndim == 3 and len(prompt) == 1 and prompt.shape[2] == width
@@ -99,9 +99,8 @@ class Trial:
         need(torch.isfinite(prompt).all(), "the prompt holds numbers that are not finite")
         same = torch.equal(prompt, self.target.encode(self.observation))
         need(same, "the same observation gives another prompt the second time: a module is in training mode?")
-        return ()
 
-    def embed_and_head(self) -> Pairs:
+    def embed_and_head(self) -> None:
         """Check the shapes and number formats that `embed`, `forward` and `head` return."""
         width, count, dtype = self.target.width, self.target.actions.tokens, self.prompt.dtype
         embedded = self.embed([0, count - 1])
@@ -112,7 +111,6 @@ class Trial:
         logits = self.target.head(hidden)
         right = logits.shape == (*shape[:2], count) and bool(torch.isfinite(logits).all())
         need(right, f"head gives {tuple(logits.shape)}, finite (1, T, {count}) are wanted")
-        return ()
 
     def embed(self, tokens: Sequence[int]) -> Tensor:
         """Return the embeddings (1, T, E) of tokens."""
@@ -204,7 +202,7 @@ class Trial:
             yield row[None], self.append(prompt[None])
 
 
-CHECKS: tuple[tuple[str, str, Callable[[Trial], Pairs]], ...] = (
+CHECKS: tuple[tuple[str, str, Callable[[Trial], Pairs | None]], ...] = (
     ("members", "", Trial.members),
     ("encode", "", Trial.encode),
     ("embed and head", "", Trial.embed_and_head),

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import write_json
@@ -26,9 +26,9 @@ from kerv_cli.base.manifests import read
 from kerv_cli.base.paths import artifact, find_target
 from kerv_cli.targets import checkpoint
 from kerv_cli.targets.checkpoint import TargetDescription
-from kerv_cli.targets.compact.compilable import compile_parts
-from kerv_cli.targets.compact.folder import build as build_compact
+from kerv_cli.targets.compact.program import compile_parts
 from kerv_cli.targets.compact.target import CompactTarget
+from kerv_cli.targets.compact.target import build as build_compact
 from kerv_cli.targets.compact.trunk import Layer, LayerStack, Rotary
 from kerv_cli.targets.settings import BuildTargetSettings, GrowSettings
 
@@ -63,12 +63,8 @@ def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
     old: list[Any] = [copy.deepcopy(layer).float() for layer in stack.layers]
     stack.compiled = None
     units, channels = old[0].down.in_features, stack.width // stack.heads
-    for name, value, least in (
-        ("width", shape.width, stack.width),
-        ("heads", shape.heads, stack.heads),
-        ("feed_forward", shape.feed_forward, units),
-        ("layers", layers, len(old)),
-    ):
+    for name, least in {"width": stack.width, "heads": stack.heads, "feed_forward": units, "layers": len(old)}.items():
+        value = layers if name == "layers" else getattr(shape, name)
         if value < least:
             raise UsageError(f"grow.{name}={value}: the policy has {least}, and only growing keeps what it computes")
     if shape.width % (shape.heads * channels):
@@ -89,7 +85,8 @@ def _grown_layer(old: Layer | None, stack: LayerStack, shape: GrowSettings, gene
     width, channels, wide = stack.width, stack.width // stack.heads, shape.width // shape.heads
     with torch.no_grad():
         for linear in (new.qkv, new.gate_up):
-            linear.weight.copy_(_noise(linear.weight.shape, generator))
+            noise = torch.randn(linear.weight.shape, generator=generator) * STD
+            linear.weight.copy_(noise.half())  # half precision holds them without loss, like the policy's own weights
         new.out.weight.zero_()
         new.down.weight.zero_()
         if old is None:
@@ -99,7 +96,9 @@ def _grown_layer(old: Layer | None, stack: LayerStack, shape: GrowSettings, gene
             norm, small = getattr(new, name), getattr(old, name)
             norm.weight[:width] = small.weight * (width / shape.width) ** 0.5
             norm.eps = small.eps * width / shape.width
-        rows = _head_rows(stack.heads, channels, wide)
+        # a channel must keep its rotary frequency: the pair of channels i of a head becomes pair i · wide / channels
+        half = torch.arange(channels // 2) * (wide // channels)
+        rows = (torch.arange(stack.heads)[:, None] * wide + torch.cat([half, half + wide // 2])).flatten()
         qkv = new.qkv.weight.view(3, shape.width, shape.width)
         qkv[1, : stack.heads * wide] = 0.0  # additional channels of keys are 0, so that scores do not change
         for part, small in enumerate(old.qkv.weight.view(3, width, width)):
@@ -107,31 +106,10 @@ def _grown_layer(old: Layer | None, stack: LayerStack, shape: GrowSettings, gene
             qkv[part, rows, :width] = small * ((wide / channels) ** 0.5 if part == 0 else 1.0)
         new.out.weight[:width, rows] = old.out.weight
         units = old.down.in_features
-        for half in range(2):
-            first, start = half * units, half * shape.feed_forward
-            new.gate_up.weight[start : start + units, :width] = old.gate_up.weight[first : first + units]
+        gate_up = new.gate_up.weight.view(2, shape.feed_forward, shape.width)
+        gate_up[:, :units, :width] = old.gate_up.weight.view(2, units, width)
         new.down.weight[:width, :units] = old.down.weight
     return new
-
-
-def _head_rows(heads: int, channels: int, wide: int) -> Tensor:
-    """Return the index that each channel of the old heads gets among the channels of the new heads.
-
-    The result is (heads · channels,). A channel must keep its rotary frequency. So the pair of channels i of an old
-    head becomes pair i · wide / channels.
-
-    Args:
-        heads: Number of old heads.
-        channels: Channels of an old head.
-        wide: Channels of a new head.
-    """
-    half = torch.arange(channels // 2) * (wide // channels)
-    return (torch.arange(heads)[:, None] * wide + torch.cat([half, half + wide // 2])).flatten()
-
-
-def _noise(shape: torch.Size, generator: torch.Generator) -> Tensor:
-    """Return random weights that half precision can hold without loss, like the policy's own weights."""
-    return (torch.randn(shape, generator=generator) * STD).half().float()
 
 
 def recipe_of(description: TargetDescription) -> Recipe:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Protocol, Self, TypeVar, runtime_checkable
+from dataclasses import dataclass
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import torch
@@ -18,32 +18,14 @@ from torch import Tensor
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.engine.protocol import EncodesMany, Target
-from kerv_cli.targets.compact.settings import TargetSettings
+from kerv_cli.targets.compact.features import WordTokenizer
 from kerv_cli.targets.compact.target import Inputs
-from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.worlds import instruction_of
 from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames
 
 BATCH = 64
 """Number of observations that a target encodes and decodes at once."""
-
-
-@runtime_checkable
-class LocatesPlaces(Protocol):
-    """A target that takes observations as tensors, and estimates the positions of object and goal.
-
-    The scout, a drafter with its own vision encoder, is trained with such a target.
-    """
-
-    words: WordTokenizer
-    settings: TargetSettings
-    frame_shape: tuple[int, int, int]  # height, width and 3 colours of an image, with all views side by side
-
-    def inputs(self, observation: Observation) -> Inputs:
-        """Return an observation as tensors on the target's device, a batch of one."""
-
-    def encode_batch(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
-        """Return prompts (B, P, E), and estimated 3D positions (B, K, 3) in metres of object, goal and so on."""
 
 
 @dataclass(frozen=True)
@@ -58,19 +40,18 @@ class Rows:
 
     def where(self, chosen: Tensor) -> Self:
         """Return the rows that a boolean mask (n,) or indices select."""
-        columns = {name: x for name, x in vars(self).items() if x is not None}
-        return replace(self, **{name: x[chosen] for name, x in columns.items()})
+        return type(self)(*(None if x is None else x[chosen] for x in vars(self).values()))
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
         """Return the rows of all `parts`, one after the other."""
-        return cls(*map(_joined, zip(*(vars(part).values() for part in parts), strict=True)))
-
-
-def _joined(column: tuple[Any, ...]) -> Any:
-    if isinstance(column[0], EncodedFrames):
-        return EncodedFrames.joined(column)
-    return None if column[0] is None else torch.cat(column)
+        joined: list[Any] = []
+        for column in zip(*(vars(part).values() for part in parts), strict=True):
+            if isinstance(column[0], EncodedFrames):
+                joined.append(EncodedFrames.joined(column))
+            else:
+                joined.append(None if column[0] is None else torch.cat(column))
+        return cls(*joined)
 
 
 @dataclass(frozen=True)
@@ -147,7 +128,7 @@ def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarr
         CheckpointError: Too few actions were recorded after the success.
     """
     check_tail(episode, chunk, f"chunks of {chunk}")
-    return np.stack([episode.labels[t : t + chunk] for t in steps])
+    return episode.labels[steps[:, None] + np.arange(chunk)]
 
 
 def observed_steps(episode: DemoEpisode, sees: bool) -> np.ndarray:
@@ -175,7 +156,7 @@ def observations_of(
         CheckpointError: The target reads images, but a step has no image, or images have a different size than the
             target takes.
     """
-    pictures: list[dict[str, np.ndarray]] = [{} for _ in steps]
+    frames: Any = [None] * len(steps)
     if target.cameras:
         if frame_shape := getattr(target, "frame_shape", None):
             check_frames(episode, frame_shape[0])
@@ -183,12 +164,11 @@ def observations_of(
         missing = steps[episode.frame_steps[rows] != steps]
         if len(missing):
             raise CheckpointError(f"step {missing[0]} of {episode.task} {episode.seed} has no frame: record every step")
-        pictures = [dict.fromkeys(target.cameras, frame) for frame in np.asarray(episode.frames[rows])]
-    states, instruction = episode.states[steps].astype(np.float64), instruction_of(episode.task)
-    count = len(space.proprioception)
-    return [
-        Observation(state[:count], state, instruction, images) for state, images in zip(states, pictures, strict=True)
-    ]
+        frames = np.asarray(episode.frames[rows])
+    count, instruction, found = len(space.proprioception), instruction_of(episode.task), []
+    for state, frame in zip(episode.states[steps].astype(np.float64), frames, strict=True):
+        found.append(Observation(state[:count], state, instruction, dict.fromkeys(target.cameras, frame)))
+    return found
 
 
 def prompts_of(target: Target, observations: Iterable[Observation], size: int = BATCH) -> Iterator[Tensor]:
@@ -207,7 +187,7 @@ def prompts_of(target: Target, observations: Iterable[Observation], size: int = 
         if isinstance(target, EncodesMany):
             yield target.encode_many(batch)
             continue
-        prompts = (target.encode(observation) for observation in batch)
+        prompts = map(target.encode, batch)
         yield from (torch.cat(list(equal)) for _, equal in itertools.groupby(prompts, lambda prompt: prompt.shape[1]))
 
 
@@ -248,21 +228,6 @@ def check_frames(episode: DemoEpisode, size: int) -> None:
         )
 
 
-def held_out_every(episodes: int, share: float) -> int:
-    """Return k such that every k-th episode is held out for validation.
-
-    Args:
-        episodes: Number of episodes.
-        share: Share of episodes to hold out, above 0 and at most 0.5.
-
-    Raises:
-        CheckpointError: There is only one episode, which cannot be in both parts.
-    """
-    if episodes < 2:
-        raise CheckpointError("one demonstration cannot be both trained on and held out: record at least two")
-    return min(max(2, round(1 / share)), episodes)
-
-
 S = TypeVar("S", bound=Rows)
 
 
@@ -279,6 +244,9 @@ def split(samples: S, share: float) -> tuple[S, S]:
         CheckpointError: There is only one episode, which cannot be in both parts.
     """
     episodes: Tensor = getattr(samples, "episodes")  # noqa: B009
-    every = held_out_every(int(episodes.max()) + 1, share)
+    count = int(episodes.max()) + 1
+    if count < 2:
+        raise CheckpointError("one demonstration cannot be both trained on and held out: record at least two")
+    every = min(max(2, round(1 / share)), count)
     held_out = episodes % every == every - 1
     return samples.where(~held_out), samples.where(held_out)

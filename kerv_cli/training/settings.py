@@ -13,7 +13,7 @@ from kerv_cli.base.limits import choice, limits, number, setting
 from kerv_cli.base.settings import RunSettings, TaskSettings, chosen
 from kerv_cli.episodes.settings import DEFAULT_TASKS, SweepSettings
 from kerv_cli.methods.settings import POLICY, MethodSettings, PolicySettings
-from kerv_cli.targets.compact.settings import TargetSettings
+from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.worlds.settings import WorldSettings
 
 DEMOS = "name of the demonstrations"

@@ -31,14 +31,12 @@ from kerv_cli.base.spaces import ActionSpace, Place
 from kerv_cli.episodes.runner import success_of
 from kerv_cli.lab.database import Database
 from kerv_cli.targets.checkpoint import TargetDescription, load_target, read_target
-from kerv_cli.targets.compact.features import places_of
-from kerv_cli.targets.compact.folder import save_target
-from kerv_cli.targets.compact.settings import TargetSettings
-from kerv_cli.targets.compact.target import CompactTarget
-from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.targets.compact.features import WordTokenizer, places_of
+from kerv_cli.targets.compact.target import CompactTarget, save_target
 from kerv_cli.targets.losses import labels_of, position_loss, token_loss
 from kerv_cli.targets.observations import Observations, read_chunks, read_observations, split
 from kerv_cli.targets.provenance import provenance_of
+from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.training.demonstrations import check_spaces, check_tasks, name_of, open_demos, seen_by
 from kerv_cli.training.fit import Metrics, batches, figures_of, fit, identity_of, refuse_other, without_subnormals
 from kerv_cli.training.settings import Begin, TrainSettings, TrainTargetSettings, quietly, refuse_unused

@@ -38,8 +38,7 @@ from kerv_cli.methods.drafters import Decodes, DrafterDescription, Metrics, Trai
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.public import DraftNetwork, PublicDrafter, PublicShape
 from kerv_cli.methods.spec_vla import RelaxedRule
-from kerv_cli.targets.compact.compilable import load_compiled
-from kerv_cli.targets.compact.program import Program
+from kerv_cli.targets.compact.program import Program, load_compiled
 from kerv_cli.targets.compact.trunk import LayerStack
 from kerv_cli.targets.observations import observations_of, prompts_of
 from kerv_cli.worlds.demos.files import DemoEpisode

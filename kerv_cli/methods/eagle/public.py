@@ -22,9 +22,10 @@ from kerv_cli.base.files import read_json
 from kerv_cli.base.manifests import read
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.targets.attention import Cache, attention_mask
+from kerv_cli.targets.checkpoint import WEIGHTS
 from kerv_cli.targets.openvla.config import CONFIG, Language
-from kerv_cli.targets.openvla.loading import SINGLE, check_layout, open_shards, sizes_of
-from kerv_cli.targets.openvla.trunk import LlamaLayer, run_layers
+from kerv_cli.targets.openvla.loading import check_layout, open_shards, sizes_of
+from kerv_cli.targets.openvla.network import LlamaLayer, run_layers
 
 EMBEDDING = "embed_tokens.weight"
 
@@ -122,14 +123,14 @@ class PublicDrafter(DraftNetwork):
         """
         if cache is not None and not cache.length:
             cache.prompt = inputs[0].shape[1]
-        x, mask = self.fc(torch.cat([*inputs], -1)), None
-        if self.shape.convention.mask == "prompt":
-            size = x.shape[1]
-            mask = attention_mask(np.tri(size, dtype=bool) if seen is None else seen, size, cache, x)
+        x = self.fc(torch.cat([*inputs], -1))
+        size, is_prompt = x.shape[1], self.shape.convention.mask == "prompt"
+        mask = attention_mask(np.tri(size, dtype=bool) if is_prompt and seen is None else seen, size, cache, x)
+        if is_prompt:
             if mask is None:
                 mask = x.new_zeros(size, cache.length + size)
             mask[:, max(1, (cache.prompt if cache is not None else size) - 1) :] = -torch.inf
-        return run_layers(self.layers, self.shape.language, x, positions, cache, seen, mask)
+        return run_layers(self.layers, self.shape.language, x, positions, cache, mask)
 
 
 def read_public(folder: Path, target: ReadableTarget, convention: Convention) -> PublicDrafter:
@@ -145,9 +146,9 @@ def read_public(folder: Path, target: ReadableTarget, convention: Convention) ->
     """
     config, pickled = folder / CONFIG, folder / "pytorch_model.bin"
     language = read(Language, read_json(config), str(config), tolerant=True)
-    if not (folder / SINGLE).is_file() and pickled.is_file():
+    if not (folder / WEIGHTS).is_file() and pickled.is_file():
         raise CheckpointError(
-            f"{pickled} is pickled and can run code when it is opened: convert it to {SINGLE} where you trust it"
+            f"{pickled} is pickled and can run code when it is opened: convert it to {WEIGHTS} where you trust it"
         )
     if language.hidden_size != target.width:
         raise CheckpointError(f"the drafter in {folder} is {language.hidden_size} wide, the target {target.width}")

@@ -35,15 +35,12 @@ from kerv_cli.engine.transfer import read
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.drafters import Decodes, Metrics, TrainableDrafter
 from kerv_cli.methods.early import EarlySettings, ScoutSettings
-from kerv_cli.targets.compact.compilable import FORMATS, Compilable, wants_gradient
-from kerv_cli.targets.compact.features import hand_features, mlp, scene_features, scene_width
-from kerv_cli.targets.compact.program import Program
-from kerv_cli.targets.compact.target import Inputs
-from kerv_cli.targets.compact.vision import VisionEncoder
+from kerv_cli.targets.compact.features import VisionEncoder, hand_features, mlp, scene_features, scene_width
+from kerv_cli.targets.compact.program import Compilable, Program
+from kerv_cli.targets.compact.target import CompactTarget, Inputs
 from kerv_cli.targets.losses import labels_of, position_loss, token_loss, within_chunk
 from kerv_cli.targets.observations import (
     BATCH,
-    LocatesPlaces,
     Observations,
     observations_of,
     prompts_of,
@@ -96,9 +93,9 @@ class EarlyNetwork(Compilable):
         self.spread = nn.Linear(settings.width, self.tokens * settings.rank)
         self.head = nn.Linear(settings.rank, actions.tokens)
 
-    def new_program(self) -> Program | None:
-        """Return the compiled network. None if there are no compiled kernels for the weights' number format."""
-        return Program(self.logits, (1, len(self.mean))) if self.mean.dtype in FORMATS else None
+    def new_program(self) -> Program:
+        """Return the compiled network."""
+        return Program(self.logits, (1, len(self.mean)))
 
     def standardise(self, features: Tensor) -> None:
         """Set the mean and the scale by which inputs are standardised, from the training features (n, F)."""
@@ -373,7 +370,7 @@ class ScoutNetwork(Compilable):
 
         Args:
             settings: Shapes of the network.
-            target: The target: a `Target` that is a `LocatesPlaces`.
+            target: The target.
             views: Number of camera views in the image, side by side.
         """
         super().__init__()
@@ -395,7 +392,7 @@ class ScoutNetwork(Compilable):
     def forward(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
         """Return the logits (B, N, V), and the estimated positions of object and goal (B, K, 3), in metres."""
         given = self.views(inputs)
-        if self.compiled is not None and not any(map(wants_gradient, given)):
+        if self.compiled is not None and self.runs_compiled(*given):
             logits, places = self.compiled(*given)
             return logits, places
         return self.network(*given)
@@ -437,12 +434,9 @@ class ScoutNetwork(Compilable):
         features, places = self.see(*given)
         return self.drafter.logits(features.to(self.drafter.head.weight.dtype)), places
 
-    def new_program(self) -> Program | None:
-        """Return the compiled network, without its vision encoders.
-
-        Return None if there are no compiled kernels for the weights' number format.
-        """
-        return Program(self.network, *self.shapes) if self.cells.weight.dtype in FORMATS else None
+    def new_program(self) -> Program:
+        """Return the compiled network, without its vision encoders."""
+        return Program(self.network, *self.shapes)
 
     @property
     def shapes(self) -> list[tuple[int, ...]]:
@@ -564,13 +558,13 @@ class ScoutDrafter(EarlyDrafter):
         return {f"{name}_error_cm": 100 * float(e) for name, e in zip(names, error, strict=True)}
 
 
-def check_sees(target: Any) -> LocatesPlaces:
+def check_sees(target: Any) -> CompactTarget:
     """Return the target, if it has a camera and estimates positions.
 
     Raises:
         CheckpointError: The target has no camera, or estimates no positions.
     """
-    if not isinstance(target, LocatesPlaces) or not getattr(target, "cameras", ()):
+    if not isinstance(target, CompactTarget) or not getattr(target, "cameras", ()):
         raise CheckpointError(
             "a scout needs a target with a camera that locates object and goal (policy=vision); this one has none"
         )

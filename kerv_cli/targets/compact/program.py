@@ -1,7 +1,8 @@
 """Run a torch module on a CPU as a `Program`: operations that are recorded once and executed by one compiled call.
 
 A program computes in *frames*: the float32 memory of one row of a batch. A *place* is the index of a number in a frame.
-`recording.py` explains both, and how a module becomes a table of operations.
+`recording.py` explains both, and how a module becomes a table of operations. `compile_parts` makes the programs of a
+module, when its weights are final.
 
 numba compiles the kernels when they are first used on a machine. It stores the machine code in NUMBA_CACHE_DIR if that
 is set, else in `__pycache__`. If this folder cannot be written, numba takes the user's cache folder. If that cannot be
@@ -20,19 +21,23 @@ import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils.weak import WeakIdKeyDictionary
 
 from kerv_cli.targets.attention import Cache
-from kerv_cli.targets.compact.bfloat16 import LARGE, Blocked, multiplies_bfloat16
+from kerv_cli.targets.checkpoint import load_state
 from kerv_cli.targets.compact.recording import ARGMAX, BFLOAT, BLOCKED, BRANCH, COLUMNS, FLOAT, HALF, INT8, PANEL, Tape
 
 _LOG = logging.getLogger("kerv")
+LARGE = 2**19
+"""A bfloat16 matrix with at least this many weights is stored in oneDNN's layout. The program multiplies smaller ones
+itself, because calling oneDNN would take longer than it saves."""
+ROWS = 32  # oneDNN chooses the layout for this many rows; 154 M weights take 27 ms for 1 row, 33 for 31, 41 for 47
 
 
 def own_folder() -> Path:
@@ -76,6 +81,40 @@ def kernels() -> ModuleType:
             numba.config.CACHE_DIR = str(mine)
             from kerv_cli.targets.compact import kernels
     return kernels
+
+
+@functools.lru_cache(maxsize=1)
+def multiplies_bfloat16() -> bool:
+    """Return whether this CPU and this build of torch can multiply bfloat16 matrices in blocked layout.
+
+    The hardware has instructions for that: AMX or AVX512-BF16.
+    """
+    supported = torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    return bool(supported) and bool(torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported())
+
+
+class Blocked:
+    """The weights of a linear layer in bfloat16, in the blocked layout of oneDNN, torch's library for a CPU's matrices.
+
+    One token and thirty tokens take almost the same time, because most time is spent on reading the weights. All other
+    operations of a program are float32. They are cheap, and rounding them would more often make the two best logits
+    almost equal. oneDNN adds in a different order for one token than for many, so the last bit of a result depends on
+    the number of tokens (docs/measuring.md).
+
+    Args:
+        weight: (outputs, inputs) bfloat16.
+        bias: (outputs,). None means zeros.
+    """
+
+    def __init__(self, weight: Tensor, bias: Tensor | None) -> None:
+        self.weight = torch.ops.mkldnn._reorder_linear_weight(weight.contiguous(), ROWS)
+        self.bias = None if bias is None else bias.to(torch.bfloat16)
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """Map inputs (…, inputs) to outputs (…, outputs) bfloat16. The sums are computed in float32."""
+        x = x.to(torch.bfloat16)
+        product: Tensor = torch.ops.mkldnn._linear_pointwise(x, self.weight, self.bias, "none", [], "")
+        return product
 
 
 class Matrix:
@@ -127,23 +166,9 @@ _MATRICES = WeakIdKeyDictionary()
 """The `Matrix` of each weight tensor. Programs with the same layer share the matrix."""
 
 
-def matrix_of(weight: Tensor, bias: Tensor | None) -> Matrix:
-    """Return the `Matrix` of a linear layer. For each weight tensor, the matrix is built once."""
-    if weight not in _MATRICES:
-        _MATRICES[weight] = Matrix(weight.detach(), bias)
-    found: Matrix = _MATRICES[weight]
-    return found
-
-
 def stored_bytes(tensors: Iterable[Tensor]) -> float:
     """Return the bytes of memory that weights take. Compiled weights count as they are stored in their `Matrix`."""
-    return float(sum(_MATRICES[x].nbytes if x in _MATRICES else x.nbytes for x in tensors))
-
-
-def forget(module: torch.nn.Module) -> None:
-    """Discard the stored matrices of a module, because its weights may have changed."""
-    for parameter in module.parameters():
-        _MATRICES.pop(parameter, None)
+    return float(sum(_MATRICES.get(x, x).nbytes for x in tensors))
 
 
 _WITHOUT_ATTENTION = Cache(1, 1, 1, 1, 1, torch.empty(0))
@@ -151,10 +176,7 @@ NOTHING = -1  # no result, or no token that ends a repetition
 
 
 class Program:
-    """A compiled function of tensors.
-
-    A copied or pickled module holds None instead of its program, because a program contains memory addresses.
-    """
+    """A compiled function of tensors."""
 
     def __init__(self, function: Callable[..., Any], *shapes: Sequence[int], repeats: bool = False) -> None:
         """Record a function as a table of operations.
@@ -167,32 +189,33 @@ class Program:
         """
         tape = Tape()
         with torch.no_grad():
-            inputs = [tape.register(*shape) for shape in shapes]
+            inputs = list(map(tape.register, shapes))
             found = function(*inputs)
         outputs = [tape.lined(x, x.shape[-1]) for x in (found if isinstance(found, tuple) else (found,))]
         if repeats:
             for given, (result, _, _) in zip(inputs, outputs, strict=False):
                 tape.copied(result, given)
         self.size, self.cache = tape.arrange([*inputs, *(x for x, _, _ in outputs)]), tape.cache
-        self.places = [(int(x.place.flatten()[0]), x.place.numel()) for x in inputs]
-        self.results = [(int(x.place.flatten()[0]), rows, stride, x.shape[1:]) for x, rows, stride in outputs]
-        self.matrices = [matrix_of(*op["matrix"]) for op in tape.ops if "matrix" in op]
-        matrices, linear = iter(self.matrices), [i for i, op in enumerate(tape.ops) if "matrix" in op]
-        table = [op | next(matrices).columns if "matrix" in op else op for op in tape.ops]
-        self.ops = np.array([[row.get(name, 0) for name in COLUMNS] for row in table], np.int64)
+        self.places = [(x.first, x.place.numel()) for x in inputs]
+        self.results = [(x.first, rows, stride, x.shape[1:]) for x, rows, stride in outputs]
+        self.matrices: list[Matrix] = []
+        self.blocked: list[tuple[int, Blocked, list[tuple[slice, slice]]]] = []
+        for i, op in enumerate(tape.ops):
+            if "matrix" in op:
+                weight, bias = op["matrix"]
+                if weight not in _MATRICES:
+                    _MATRICES[weight] = Matrix(weight.detach(), bias)
+                matrix: Matrix = _MATRICES[weight]
+                self.matrices.append(matrix)
+                op |= matrix.columns
+                if matrix.blocked is not None:
+                    self.blocked.append((i, matrix.blocked, _columns_of(op)))
+        self.ops = np.array([[op.get(name, 0) for name in COLUMNS] for op in tape.ops], np.int64)
         self.indices = np.array(tape.indices, np.int64)
         self.numbers = np.concatenate([*tape.numbers, np.zeros(1, np.float32)])
         found = np.flatnonzero(np.isin(self.ops[:, 0], (ARGMAX, BRANCH)))
         self.last = int(found[0]) + 1 if len(found) else len(self.ops)
         self.run = kernels().run
-        self.blocked = [
-            (i, m.blocked, [_columns_of(table[i], r) for r in range(table[i]["rows"])])
-            for i, m in zip(linear, self.matrices, strict=True)
-            if m.blocked is not None
-        ]
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(None), ()
 
     def __call__(
         self, *inputs: Tensor, positions: Tensor | None = None, cache: Cache | None = None, mask: Tensor | None = None
@@ -324,7 +347,107 @@ def _executed(results: np.ndarray) -> int:
     return int((results[:, 0, 0] != NOTHING).sum())
 
 
-def _columns_of(op: dict[str, Any], row: int) -> tuple[slice, slice]:
-    """Return where a frame holds a row of a large matrix's input, and where its result goes."""
-    a, out = op["a"] + row * op["stride"], op["out"] + row * op["step"]
-    return slice(a, a + op["width"]), slice(out, out + op["panels"])
+def _columns_of(op: dict[str, Any]) -> list[tuple[slice, slice]]:
+    """Return where a frame holds each row of a large matrix's input, and where the row's result goes."""
+    columns = []
+    for row in range(op["rows"]):
+        a, out = op["a"] + row * op["stride"], op["out"] + row * op["step"]
+        columns.append((slice(a, a + op["width"]), slice(out, out + op["panels"])))
+    return columns
+
+
+M = TypeVar("M", bound=nn.Module)
+
+
+class Compilable(nn.Module):
+    """A module that can be compiled for a CPU while its weights are frozen.
+
+    Moving the module, loading weights into it, unfreezing or copying it discards the compiled form, and torch computes
+    as usual. After changing weights in any other way (`parameter.data`, a submodule's own `load_state_dict`), call
+    `compile_parts` again.
+
+    Attributes:
+        compiled: The compiled form. None if the module is not compiled.
+    """
+
+    compiled: Any = None
+
+    def new_program(self) -> Any:
+        """Return the compiled form of this module, for `compile_parts`. None if the module cannot be compiled."""
+        return None
+
+    def runs_compiled(self, *inputs: Tensor) -> bool:
+        """Return whether to use the compiled form: True if it exists and no gradients are needed.
+
+        While a program is recorded, the inputs are `Recorded`, and torch's form of the module is recorded.
+        """
+        for x in inputs:
+            if not isinstance(x, Tensor) or (x.requires_grad and torch.is_grad_enabled()):
+                return False
+        return self.compiled is not None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "compiled": None}  # it contains memory addresses or a session of ONNX Runtime
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        self.compiled = None
+        return super()._apply(fn, recurse)
+
+    def _load_from_state_dict(self, *arguments: Any, **keywords: Any) -> None:
+        self.compiled = None
+        super()._load_from_state_dict(*arguments, **keywords)
+
+    def requires_grad_(self, requires_grad: bool = True) -> Self:
+        """Freeze or unfreeze all parameters. Unfreezing discards the compiled form of every submodule, too."""
+        for part in self.modules():
+            if requires_grad and isinstance(part, Compilable):
+                part.compiled = None
+        return super().requires_grad_(requires_grad)
+
+
+class CompilableLinear(Compilable, nn.Linear):
+    """A linear layer that is compiled by itself, not as a part of a larger module. An example is an output head."""
+
+    def new_program(self) -> Program:
+        """Return the compiled layer."""
+        return Program(super().forward, (1, self.in_features))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map inputs (…, in_features) to outputs (…, out_features). The compiled form returns float32."""
+        return self.compiled(x)[0].view(*x.shape[:-1], -1) if self.runs_compiled(x) else super().forward(x)
+
+
+def compile_parts(module: nn.Module) -> None:
+    """Compile every `Compilable` submodule of a module, and store the compiled form in its `compiled`.
+
+    Nothing happens unless all parameters are frozen, on a CPU, and all in float32 or all in bfloat16.
+    """
+    kinds = {(p.device.type, p.dtype, p.requires_grad) for p in module.parameters()}
+    if kinds not in ({("cpu", torch.float32, False)}, {("cpu", torch.bfloat16, False)}):
+        return
+    for parameter in module.parameters():
+        _MATRICES.pop(parameter, None)  # the weights may have changed
+    parts = [part for part in module.modules() if isinstance(part, Compilable)]
+    for part in parts:
+        part.compiled = None
+    for part in parts:
+        part.compiled = part.new_program()
+
+
+def load_compiled(module: M, folder: Path, kind: str, device: str | torch.device, dtype: torch.dtype) -> M:
+    """Load the weights in a folder into a module. Move it to a device, freeze it, and on a CPU compile it.
+
+    Args:
+        module: A module with the shapes of the stored weights.
+        folder: Folder with `model.safetensors`.
+        kind: Kind of artifact, such as `drafter`, for error messages.
+        device: Device to move the module to.
+        dtype: Number format to convert the weights to.
+
+    Raises:
+        CheckpointError: The weights are missing, damaged, or do not fit the module.
+    """
+    load_state(module, folder, kind)
+    module = module.to(device=device, dtype=dtype).eval().requires_grad_(False)
+    compile_parts(module)
+    return module

@@ -26,7 +26,7 @@ LINEAR, NORM, SILU, TANH, ADD, MULTIPLY, AFFINE, CLAMP, GATHER, EMBED, ARGMAX, A
 """Codes of the operations."""
 HALF, INT8, FLOAT, BFLOAT, BLOCKED = range(5)
 """Number formats in which the weights of a matrix can be stored: float16, int8 with a scale per output, float32,
-bfloat16, and bfloat16 in oneDNN's layout (see `bfloat16.py`)."""
+bfloat16, and bfloat16 in oneDNN's layout (`program.Blocked`)."""
 PANEL = 64
 """Number of outputs in a panel. A matrix is stored panel by panel."""
 COLUMNS = ["code", "out", "a", "b", "rows", "width", "stride", "first", "step", "weights", "factors", "panels", "kind"]
@@ -61,6 +61,11 @@ class Recorded:
 
     def __init__(self, tape: Tape, place: Tensor) -> None:
         self.tape, self.place, self.shape = tape, place, place.shape
+
+    @property
+    def first(self) -> int:
+        """Place of the first element."""
+        return int(self.place.flatten()[0])
 
     @classmethod
     def __torch_function__(cls, function: Any, _: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -97,10 +102,10 @@ class Recorded:
 
     def affine(self, factor: Any, offset: Any) -> Recorded:
         """Return self · factor + offset. Both are constants: numbers, or tensors that broadcast with this value."""
-        constants = [torch.as_tensor(x, dtype=torch.float32) for x in (factor, offset)]
-        shape = torch.broadcast_shapes(self.shape, *(x.shape for x in constants))
-        numbers = torch.cat([x.expand(shape).flatten() for x in constants])
-        return self.tape.elementwise(AFFINE, self.expand(shape), numbers=numbers)
+        factor, offset = torch.as_tensor(factor, dtype=torch.float32), torch.as_tensor(offset, dtype=torch.float32)
+        place, factor, offset = torch.broadcast_tensors(self.place, factor, offset)
+        numbers = torch.cat([factor.flatten(), offset.flatten()])
+        return self.tape.elementwise(AFFINE, Recorded(self.tape, place), numbers=numbers)
 
     def clamp(self, low: float, high: float) -> Recorded:
         """Limit every element to low … high."""
@@ -109,8 +114,8 @@ class Recorded:
     def mean(self, dim: int) -> Recorded:
         """Average over dimension 1, the only one that is supported."""
         assert dim == 1
-        first, *others = (self[:, i] for i in range(self.shape[1]))
-        return sum(others, start=first) / self.shape[1]
+        first, *others = self.split(1, 1)
+        return (sum(others, start=first) / self.shape[1])[:, 0]
 
     def argmax(self, dim: int) -> Recorded:
         """Return the index (1,) of the greatest of all elements. `dim` must be -1."""
@@ -177,11 +182,11 @@ class Tape:
         self.begins = [0]
         self.cache = 0, 1, 1
 
-    def register(self, *shape: int) -> Recorded:
+    def register(self, shape: Sequence[int]) -> Recorded:
         """Reserve a register (a contiguous range of places in the frame) for a tensor of this shape, and return it."""
         first, size = self.begins[-1], int(np.prod(shape))
         self.begins.append(first + size + 1)  # one unused place, so that `lined` never takes two registers for one
-        return Recorded(self, torch.arange(first, first + size).view(shape))
+        return Recorded(self, torch.arange(first, first + size).view(*shape))
 
     def emit(
         self,
@@ -205,12 +210,15 @@ class Tape:
         Returns:
             The result.
         """
-        out = out if isinstance(out, Recorded) else self.register(*out)
-        lined = [self.lined(x, x.place.numel() if i else width) for i, x in enumerate(inputs)]
-        first = [int(x.place.flatten()[0]) for x in (out, *(x for x, _, _ in lined))]
-        shape = {"rows": lined[0][1], "width": width, "stride": lined[0][2], "first": self.placed(numbers)}
-        places = dict(zip(("out", "a", "b"), first, strict=False))
-        self.ops.append({"code": code, "reads": [x.place for x, _, _ in lined], **shape, **places, **columns})
+        out = out if isinstance(out, Recorded) else self.register(out)
+        x, rows, stride = self.lined(inputs[0], width)
+        op = {"code": code, "out": out.first, "a": x.first, "rows": rows, "width": width, "stride": stride}
+        reads = [x.place]
+        for x in inputs[1:]:
+            second, _, _ = self.lined(x, x.place.numel())
+            op["b"] = second.first
+            reads.append(second.place)
+        self.ops.append({**op, "first": self.placed(numbers), "reads": reads, **columns})
         return out
 
     def lined(self, x: Recorded, width: int) -> tuple[Recorded, int, int]:
@@ -227,13 +235,13 @@ class Tape:
         stride = int(rows[1, 0] - rows[0, 0]) if len(rows) > 1 else width
         if torch.equal(rows, rows[0, 0] + torch.arange(len(rows))[:, None] * stride + torch.arange(width)):
             return x, len(rows), stride
-        return self.copied(x, self.register(*x.shape)), len(rows), width
+        return self.copied(x, self.register(x.shape)), len(rows), width
 
     def copied(self, x: Recorded, out: Recorded) -> Recorded:
         """Append an operation that copies the elements of `x`, in order, into the register of `out`. Return `out`."""
         places = x.place.flatten().tolist()
-        op = {"code": GATHER, "rows": 1, "width": len(places), "first": len(self.indices), "reads": [x.place]}
-        self.ops.append(op | {"out": int(out.place.flatten()[0])})
+        op = {"code": GATHER, "out": out.first, "rows": 1, "width": len(places), "first": len(self.indices)}
+        self.ops.append({**op, "reads": [x.place]})
         self.indices += places
         return out
 
@@ -277,8 +285,10 @@ class Tape:
 
         life = {int(r): [0, len(self.ops)] for x in kept for r in np.unique(register_of(x.place))}
         for i, op in enumerate(self.ops):
-            for r in np.unique(np.concatenate([register_of(x).ravel() for x in (op["out"], *op["reads"])])):
-                life.setdefault(int(r), [i, i])[1] = max(i, life.get(int(r), [0, 0])[1])
+            used = np.concatenate([np.ravel(op["out"]), *map(np.ravel, op["reads"])])
+            for r in np.unique(register_of(used)).tolist():
+                life.setdefault(r, [i, i])
+                life[r][1] = max(i, life[r][1])
         place, done = np.zeros(len(begins), np.int64), list[int]()
         for r, (born, last) in sorted(life.items(), key=lambda item: item[1][0]):
             for other in sorted(done, key=place.__getitem__):
@@ -291,7 +301,8 @@ class Tape:
             return np.asarray(places) + (place - begins)[register_of(places)]
 
         for op in self.ops:
-            op |= {name: int(moved(op[name])) for name in ("out", "a", "b") if name in op}
+            for name in op.keys() & {"out", "a", "b"}:
+                op[name] = int(moved(op[name]))
         for x in kept:
             x.place = torch.from_numpy(moved(x.place))
         self.indices = moved(np.array(self.indices, np.int64)).tolist()

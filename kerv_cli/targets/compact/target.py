@@ -17,7 +17,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,24 +26,17 @@ import torch
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
+from kerv_cli.engine.protocol import Seen
 from kerv_cli.engine.transfer import upload
 from kerv_cli.targets.attention import Cache, attention_mask
-from kerv_cli.targets.compact.compilable import FORMATS, Compilable, CompilableLinear, wants_gradient
-from kerv_cli.targets.compact.features import (
-    hand_features,
-    mlp,
-    places_of,
-    privileged_features,
-    privileged_width,
-    scene_features,
-    scene_width,
-)
-from kerv_cli.targets.compact.program import Program
-from kerv_cli.targets.compact.settings import TargetSettings
-from kerv_cli.targets.compact.text import WordTokenizer
+from kerv_cli.targets.checkpoint import FLOAT32, TargetDescription, save_module, target_fields
+from kerv_cli.targets.compact import features
+from kerv_cli.targets.compact.features import VisionEncoder, WordTokenizer, mlp
+from kerv_cli.targets.compact.program import Compilable, CompilableLinear, Program, load_compiled
 from kerv_cli.targets.compact.trunk import Trunk
-from kerv_cli.targets.compact.vision import VisionEncoder
+from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.worlds.views import frame_shape, views_of
 
 
@@ -64,7 +58,7 @@ class Inputs:
 
 
 class Programs(NamedTuple):
-    """The compiled programs of a target. A copied or pickled target holds None instead of them.
+    """The compiled programs of a target.
 
     Attributes:
         prompt: Program that encodes a prompt.
@@ -74,9 +68,6 @@ class Programs(NamedTuple):
 
     prompt: Program
     step: Program
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return type(None), ()
 
 
 class CompactTarget(Compilable):
@@ -93,6 +84,8 @@ class CompactTarget(Compilable):
         cameras: One name: the camera whose images are read. Empty if the policy reads the state.
         frame_shape: Shape (height, width, 3) of an image.
         segments: Positions of the tokens in each part of the prompt (a slice), by the part's name.
+        max_prompt: P, number of prompt tokens. It is the same for every observation and instruction.
+        pooled_width: F, number of values that `pooled` returns per prompt.
         sha256: Hash of the weights that were loaded. Empty if no weights were loaded.
         chunk: H, number of control steps that the policy was trained to decode at once.
         parallel: Whether the policy decodes all tokens in one forward (`parallel_pass`). It then cannot decode single
@@ -127,14 +120,17 @@ class CompactTarget(Compilable):
         self.cameras = (camera,) if s.observation == "vision" else ()
         views = len(views_of(camera)) if self.cameras else 0
         self.segments, self.frame_shape = _segments(s, views), frame_shape(camera, s.image_size)
+        self.max_prompt = self.segments["proprioception"].stop
+        self.pooled_width = s.width * (s.scene_tokens + (3 if self.cameras else 2))
         p, places = len(observation.proprioception), len(observation.places)
         self.register_buffer("centre", torch.tensor(observation.centre), persistent=False)
         self.embedding = nn.Embedding(actions.tokens, s.width)
         self.embedding.weight.data = _smooth_table(actions.tokens, s.width)
         self.word_embedding = nn.Embedding(words.size, s.width)
         nn.init.normal_(self.word_embedding.weight, std=0.02)
-        features = scene_width(observation) + (privileged_width(observation) if s.observation == "state" else 0)
-        self.scene = mlp(features, 2 * s.width, s.scene_tokens * s.width)
+        read = features.scene_width(observation)
+        read += features.privileged_width(observation) if s.observation == "state" else 0
+        self.scene = mlp(read, 2 * s.width, s.scene_tokens * s.width)
         self.proprioception = mlp(p, s.width, s.width)
         if s.observation == "vision":
             shapes = s.image_size, s.grid, s.keypoints, s.channels, s.width, s.norm
@@ -149,19 +145,9 @@ class CompactTarget(Compilable):
             self.queries = nn.Parameter(queries + 0.02 * torch.randn_like(queries))
 
     @property
-    def max_prompt(self) -> int:
-        """P, number of prompt tokens. It is the same for every observation and instruction."""
-        return self.segments["proprioception"].stop
-
-    @property
     def encoders(self) -> tuple[VisionEncoder, ...]:
         """The encoders of a vision policy, one per camera view from left to right."""
         return self.vision, *self.further_views
-
-    @property
-    def pooled_width(self) -> int:
-        """F, number of values that `pooled` returns per prompt."""
-        return self.width * (self.settings.scene_tokens + (3 if self.cameras else 2))
 
     def pooled(self, prompt: Tensor) -> Tensor:
         """Pool prompts (B, P, E) into fixed vectors (B, F).
@@ -196,10 +182,8 @@ class CompactTarget(Compilable):
             CheckpointError: Proprioception, state or image has a different size than in training, or the image is
                 missing.
         """
-        proprioception, state = (
-            upload(np.asarray(x, dtype=np.float32), self.device)[None]
-            for x in (observation.proprioception, observation.state)
-        )
+        proprioception = upload(np.asarray(observation.proprioception, dtype=np.float32), self.device)[None]
+        state = upload(np.asarray(observation.state, dtype=np.float32), self.device)[None]
         given = proprioception.shape[1], state.shape[1]
         # a policy that reads images ignores the state, so that its length does not matter
         sizes = len(self.observation.proprioception), given[1] if self.cameras else self.observation.state
@@ -238,10 +222,9 @@ class CompactTarget(Compilable):
         Raises:
             CheckpointError: An observation does not fit the target, see `inputs`.
         """
-        batch = [self.inputs(observation) for observation in observations]
-        images = [one.images for one in batch if one.images is not None]
-        rows = (torch.cat([getattr(one, name) for one in batch]) for name in ("proprioception", "states", "words"))
-        return self.encode_batch(Inputs(torch.cat(images) if images else None, *rows))[0]
+        columns: Any = zip(*(vars(inputs).values() for inputs in map(self.inputs, observations)), strict=True)
+        joined: Any = (None if column[0] is None else torch.cat(column) for column in columns)
+        return self.encode_batch(Inputs(*joined))[0]
 
     def encode_batch(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
         """Encode a batch of observations.
@@ -253,9 +236,10 @@ class CompactTarget(Compilable):
         if self.cameras:
             assert inputs.images is not None
             images = inputs.images.split(self.settings.image_size, -1)
-            views = [encoder(image) for encoder, image in zip(self.encoders, images, strict=True)]
-            given[2:] = torch.cat([tokens for tokens, _ in views], 1), torch.cat([points for _, points in views], -1)
-        if self.compiled is not None and not any(map(wants_gradient, given)):
+            views = (encoder(image) for encoder, image in zip(self.encoders, images, strict=True))
+            tokens, points = zip(*views, strict=True)
+            given[2:] = torch.cat(tokens, 1), torch.cat(points, -1)
+        if self.compiled is not None and self.runs_compiled(*given):
             prompt, places = self.compiled.prompt(*given)
             return prompt.to(self.dtype), places
         return self.prompt(*given)
@@ -271,19 +255,18 @@ class CompactTarget(Compilable):
             seen: For a vision policy two tensors from its vision encoders: vision tokens (B, grid² · views, E) and
                 image points (B, 2 · keypoints · views). For any other policy the states (B, s).
         """
-        embedded, hand = self.word_embedding(words), hand_features(proprioception, self.centre)
+        embedded, hand = self.word_embedding(words), features.hand_features(proprioception, self.centre)
+        *tokens, read = seen  # vision tokens and image points, or only states
         if self.cameras:
-            tokens, points = seen
-            places = self.located(points, hand, embedded)
-            features, parts = scene_features(proprioception, places, self.centre), [tokens]
+            places = self.located(read, hand, embedded)
+            known = features.scene_features(proprioception, places, self.centre)
         else:
-            places = places_of(seen[0], self.observation)
-            features = scene_features(proprioception, places, self.centre)
-            features = torch.cat([features, privileged_features(proprioception, seen[0], self.observation)], -1)
-            parts = []
-        scene = self.scene(features.to(self.head.weight.dtype)).unflatten(-1, (self.settings.scene_tokens, -1))
+            places = features.places_of(read, self.observation)
+            known = features.scene_features(proprioception, places, self.centre)
+            known = torch.cat([known, features.privileged_features(proprioception, read, self.observation)], -1)
+        scene = self.scene(known.to(self.head.weight.dtype)).unflatten(-1, (self.settings.scene_tokens, -1))
         felt = self.proprioception(hand.to(self.head.weight.dtype))[:, None]
-        return torch.cat([*parts, embedded, scene, felt], 1), places
+        return torch.cat([*tokens, embedded, scene, felt], 1), places
 
     def located(self, points: Tensor, hand: Tensor, words: Tensor) -> Tensor:
         """Estimate the 3D positions (B, K, 3) of the task's places (object, goal, …) in metres.
@@ -295,17 +278,11 @@ class CompactTarget(Compilable):
         """
         # bfloat16 would round image points to a fifth of a cell: millimetres matter here
         with torch.autocast(points.device.type, enabled=False):
-            features = torch.cat([points, hand, words.mean(1)], -1).to(self.head.weight.dtype)
-            located = self.locate(features)
+            located = self.locate(torch.cat([points, hand, words.mean(1)], -1).to(self.head.weight.dtype))
         return located.to(torch.float32).unflatten(-1, (-1, 3)) * 0.1 + self.centre
 
-    def new_program(self) -> Programs | None:
-        """Return compiled programs that encode a prompt and decode tokens.
-
-        None if no compiled kernels exist for the weights' number format.
-        """
-        if self.dtype not in FORMATS:
-            return None
+    def new_program(self) -> Programs:
+        """Return compiled programs that encode a prompt and decode tokens."""
         s, space = self.settings, self.observation
         shapes: list[tuple[int, ...]] = [(1, s.instruction_tokens), (1, len(space.proprioception))]
         if self.cameras:
@@ -321,24 +298,11 @@ class CompactTarget(Compilable):
         return Programs(Program(self.prompt, *shapes), Program(step, (1, 1), repeats=True))
 
     def join(self, function: Callable[..., Any], *shapes: tuple[int, ...], repeats: bool = False) -> Program | None:
-        """Compile a function that calls modules of the target and of a compiled drafter.
-
-        Args:
-            function: The function. Its inputs are float32 tensors of batch size 1.
-            shapes: Shape of each input.
-            repeats: Whether the program can run several times in one call. The outputs of each run are the inputs of
-                the next, to decode or draft several tokens.
-
-        Returns:
-            The compiled program. None if the target is not compiled.
-        """
+        """Compile a function that calls modules of the target and of a compiled drafter; see `JoinsDrafters.join`."""
         return Program(function, *shapes, repeats=repeats) if self.compiled is not None else None
 
     def enlarge(self, drafter: Any) -> None:
-        """Enlarge a small policy's drafter in place, so that it fits this target.
-
-        Does nothing if this target was not made by enlarging a small policy (docs/methods.md §0.2).
-        """
+        """Enlarge a small policy's drafter in place, if this target was made by enlarging a small policy."""
         if self.enlarges is not None:
             self.enlarges(drafter)
 
@@ -347,53 +311,26 @@ class CompactTarget(Compilable):
         return self.embedding(tokens)
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
-        """Return an empty key/value cache.
-
-        Args:
-            batch: Number of sequences.
-            capacity: Maximum number of tokens.
-            fixed: Whether every forward attends to all slots, so that its shapes are fixed. None: only on CUDA.
-        """
+        """Return an empty key/value cache. `LayerStack.new_cache` explains the arguments."""
         return self.trunk.new_cache(batch, capacity, fixed)
 
-    def forward(
-        self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
-    ) -> Tensor:
-        """Return the hidden states (B, T, E) of embeddings x (B, T, E). `Trunk.forward` explains the arguments."""
+    def forward(self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: Seen = None) -> Tensor:
+        """Return the hidden states (B, T, E) of embeddings x (B, T, E). `Target.forward` explains the arguments."""
         return self.trunk(x, positions, cache, seen)
 
     def continue_greedily(self, token: int, count: int, cache: Cache, end: int | None = None) -> list[int] | None:
-        """Decode the next `count` tokens greedily in one compiled call.
+        """Decode the next `count` tokens greedily in one compiled call. None if this target is not compiled.
 
-        Args:
-            token: The last token, not yet in the cache.
-            count: Number of tokens to decode.
-            cache: Keys and values of all tokens before `token`. The cache grows by the number of decoded tokens.
-            end: Token after which to stop. None: decode all `count` tokens.
-
-        Returns:
-            The tokens. None if this target is not compiled.
+        `ContinuesGreedily` explains the arguments.
         """
         if self.compiled is None or cache.fixed:
             return None
         tokens = self.compiled.step.repeat(count, torch.tensor([[token]]), cache=cache, end=end)
         cache.length += len(tokens)
-        return [int(token) for token in tokens[:, 0]]
+        return tokens[:, 0].astype(int).tolist()
 
-    def predict(
-        self, tokens: Tensor, positions: Tensor, cache: Cache, seen: np.ndarray | Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """Read T new tokens. A compiled target does this in one call.
-
-        Args:
-            tokens: The new tokens (T,) int64.
-            positions: (T,) rotary positions of the new tokens.
-            cache: Keys and values of earlier tokens. This forward appends the new ones.
-            seen: (T, M) bool, which of the last M tokens, old or new, each new token attends to. None: causal mask.
-
-        Returns:
-            The most probable token after each new token, (T,) int64, and the hidden states (1, T, E) of the new tokens.
-        """
+    def predict(self, tokens: Tensor, positions: Tensor, cache: Cache, seen: Seen) -> tuple[Tensor, Tensor]:
+        """Read T new tokens, if compiled in one call. `PredictsTokens.predict` explains arguments and results."""
         if self.compiled is None or cache.fixed:
             hidden = self(self.embed(tokens[None]), positions, cache, seen)
             return self.head(hidden[0]).argmax(-1), hidden
@@ -452,3 +389,50 @@ def _smooth_table(tokens: int, width: int) -> Tensor:
     frequency = torch.exp(torch.rand(width, generator=generator) * 4.0)  # up to 55 rad per unit
     phase = torch.rand(width, generator=generator) * 2 * torch.pi
     return 0.03 * torch.cos(centres * frequency + phase)
+
+
+def save_target(
+    folder: Path,
+    target: CompactTarget,
+    environment: str,
+    provenance: dict[str, Any],
+    stored: str = FLOAT32,
+    state_range: Sequence[Sequence[float]] | None = None,
+) -> str:
+    """Write a target's weights and `target.json`. Return the SHA-256 of the weights.
+
+    Args:
+        folder: Folder to write to.
+        target: The target.
+        environment: Name of the environment that the target's demonstrations come from.
+        provenance: How the target was made, see `provenance_of`.
+        stored: Number format of the stored weights: float32, float16 or int8.
+        state_range: The 0.1th percentile of each number of the demonstrations' states, then the 99.9th percentile of
+            each. None: not recorded.
+    """
+    others: dict[str, Any] = {"cameras": target.cameras, "words": target.words.words, "provenance": provenance}
+    if state_range:
+        others["state_range"] = state_range
+    spaces = target.actions, target.observation
+    fields = target_fields("compact", asdict(target.settings), environment, *spaces, **others)
+    return save_module(folder, "target", target, fields, stored)
+
+
+def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> CompactTarget:
+    """Load a compact target for inference. The target is frozen and, on a CPU, compiled.
+
+    Args:
+        folder: Folder with the weights.
+        description: The content of its `target.json`.
+        device: Device to load it to.
+        dtype: Number format to convert the weights to.
+
+    Raises:
+        CheckpointError: The description does not belong to a compact target, or the weights do not fit it.
+    """
+    settings = read(TargetSettings, description.settings, str(folder / "target.json"))
+    camera = description.cameras[0] if description.cameras else ""
+    words = WordTokenizer(description.words)
+    target = CompactTarget(settings, description.actions, description.observation, words, camera)
+    target.sha256 = description.sha256
+    return load_compiled(target, folder, "target", device, dtype)

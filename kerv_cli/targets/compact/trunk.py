@@ -14,15 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.engine.protocol import Seen
 from kerv_cli.engine.transfer import upload
-from kerv_cli.targets.attention import Cache, CapturedCache, Slots, attend, attention_mask, rotate
-from kerv_cli.targets.compact.compilable import FORMATS, Compilable, wants_gradient
-from kerv_cli.targets.compact.program import Program
+from kerv_cli.targets.attention import Cache, CapturedCache, Rotation, Slots, attend, attention_mask, rotate
+from kerv_cli.targets.compact.program import Compilable, Program
 
 POSITIONS, BASE = 1024, 10_000.0  # of the rotary embedding: number of positions, base of the frequencies
 
@@ -41,7 +40,7 @@ class Rotary(nn.Module):
         # the sign of the swapped half is folded into the table: x·cos + swap(x)·sin
         self.register_buffer("sin", torch.cat([-angles.sin(), angles.sin()], -1), persistent=False)
 
-    def forward(self, positions: Tensor | slice) -> tuple[Tensor, Tensor]:
+    def forward(self, positions: Tensor | slice) -> Rotation:
         """Return the cosines and the sines, (T, 1, C) each, at positions (T,)."""
         return self.cos[positions][:, None], self.sin[positions][:, None]
 
@@ -60,12 +59,7 @@ class Layer(nn.Module):
         self.down = nn.Linear(feed_forward, width, bias=False)
 
     def forward(
-        self,
-        x: Tensor,
-        rotary: tuple[Tensor, Tensor],
-        cache: Tensor | None = None,
-        slots: Slots | None = None,
-        mask: Tensor | None = None,
+        self, x: Tensor, rotary: Rotation, cache: Tensor | None = None, slots: Slots = None, mask: Tensor | None = None
     ) -> Tensor:
         """Compute the output (B, T, width) of the layer.
 
@@ -143,17 +137,11 @@ class LayerStack(Compilable):
         fixed = like.is_cuda if fixed is None else fixed
         return CapturedCache(*sizes, like) if fixed else Cache(*sizes, like)
 
-    def new_program(self) -> Program | None:
-        """Return the stack as a compiled `Program`, for `compile_parts`.
+    def new_program(self) -> Program:
+        """Return the stack as a compiled `Program`, for `compile_parts`."""
+        return Program(self.recorded, *[(1, 1, self.outer)] * self.inputs)
 
-        None if no compiled kernels exist for the weights' number format.
-        """
-        compiles = self.weight.dtype in FORMATS
-        return Program(self.recorded, *[(1, 1, self.outer)] * self.inputs) if compiles else None
-
-    def run(
-        self, inputs: Sequence[Tensor], positions: Tensor, cache: Cache | None, seen: np.ndarray | Tensor | None
-    ) -> Tensor:
+    def run(self, inputs: Sequence[Tensor], positions: Tensor, cache: Cache | None, seen: Seen) -> Tensor:
         """Run all layers over T new tokens, and return their hidden states (B, T, E).
 
         Args:
@@ -171,9 +159,8 @@ class LayerStack(Compilable):
                 seen = F.pad(F.pad(seen, (0, padding)), (0, 0, 0, padding), value=True)
         x = inputs[0]
         mask = attention_mask(seen, x.shape[1], cache, x)
-        compiled = self.compiled if self.runs_compiled(x) and (cache is None or not cache.fixed) else None
-        if isinstance(compiled, Program):
-            hidden = compiled(*inputs, positions=positions, cache=cache, mask=mask)[0].view(x.shape).to(x.dtype)
+        if self.runs_compiled(x) and not (cache is not None and cache.fixed):
+            hidden = self.compiled(*inputs, positions=positions, cache=cache, mask=mask)[0].view(x.shape).to(x.dtype)
         elif isinstance(cache, CapturedCache) and self.captures(x):
             assert mask is not None
             hidden = self.finish(cache.run(self.run_layers, self.begin(*inputs), positions, mask))
@@ -186,7 +173,7 @@ class LayerStack(Compilable):
 
     def captures(self, x: Tensor) -> bool:
         """Return whether a forward of x (B, T, E) can run in a CUDA graph: on a GPU, with B = 1, without gradients."""
-        return x.is_cuda and x.shape[0] == 1 and not wants_gradient(x)
+        return x.is_cuda and x.shape[0] == 1 and not (x.requires_grad and torch.is_grad_enabled())
 
     def recorded(self, *inputs: Tensor) -> Tensor:
         """Record the operations of all layers on one token, to compile them. Nothing is computed.
@@ -200,7 +187,7 @@ class LayerStack(Compilable):
         return self.finish(self.run_layers(self.begin(*inputs), slice(None), None, None, None))
 
     def run_layers(
-        self, x: Tensor, positions: Tensor | slice, cache: Cache | None, slots: Slots | None, mask: Tensor | None
+        self, x: Tensor, positions: Tensor | slice, cache: Cache | None, slots: Slots, mask: Tensor | None
     ) -> Tensor:
         """Return the output of the last layer, computed by torch.
 
@@ -228,15 +215,6 @@ class Trunk(LayerStack):
                 if name.endswith(("out.weight", "down.weight")):
                     parameter.data /= (2 * layers) ** 0.5
 
-    def forward(
-        self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
-    ) -> Tensor:
-        """Run all layers over T new tokens, and return their hidden states (B, T, E).
-
-        Args:
-            x: (B, T, E) embeddings of the new tokens.
-            positions: (T,) rotary positions of the new tokens.
-            cache: Keys and values of earlier tokens. This forward appends the new ones. None: no earlier tokens.
-            seen: (T, M) bool, which of the last M tokens, old or new, each new token attends to. None: causal mask.
-        """
+    def forward(self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: Seen = None) -> Tensor:
+        """Return the hidden states (B, T, E) of embeddings x (B, T, E). `run` explains the arguments."""
         return self.run((x,), positions, cache, seen)

@@ -229,10 +229,9 @@ def action_space(shape: Shape, bounds: Bounds, like: ActionSpace | None, control
             f"({', '.join(space.names)}): they are of another robot"
         )
     low, high = [-1.0] * space.dofs, [1.0] * space.dofs
-    for dof, normalised in enumerate(mask):
+    for dof, (name, normalised) in enumerate(zip(space.names, mask, strict=True)):
         if normalised:
             low[dof], high[dof] = bounds.q01[dof], bounds.q99[dof]
-    for name, a, b in zip(space.names, low, high, strict=True):
-        if not a < b:
+        if not low[dof] < high[dof]:
             raise CheckpointError(f"the statistics have q01 = q99 of {name}: they are damaged")
     return replace(space, low=tuple(low), high=tuple(high), bins=shape.bins, end_token=True)

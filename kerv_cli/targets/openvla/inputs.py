@@ -88,8 +88,8 @@ def as_in_libero(image: np.ndarray, size: int) -> np.ndarray:
     Image.fromarray(image).save(file, "JPEG", quality=95, subsampling="4:2:0")
     pixels = np.asarray(Image.open(file), dtype=np.float32)
     # each channel as floats: with integers Pillow would clip values between its two passes
-    channels = (Image.fromarray(pixels[:, :, i]).resize((size, size), Image.Resampling.LANCZOS) for i in range(3))
-    return np.stack([np.asarray(one) for one in channels], -1).round().clip(0, 255).astype(np.uint8)
+    channels: Any = (Image.fromarray(pixels[:, :, i]).resize((size, size), Image.Resampling.LANCZOS) for i in range(3))
+    return np.stack(list(channels), -1).round().clip(0, 255).astype(np.uint8)
 
 
 def pixels_of(
@@ -152,8 +152,17 @@ class Prompter:
             KervError: The Python package `tokenizers` is not installed.
         """
         path = folder / TOKENIZER
+        if not path.is_file():
+            raise CheckpointError(f"no {TOKENIZER} in {folder}: copy the one that was published with the checkpoint")
+        try:
+            from tokenizers import Tokenizer
+        except ImportError as error:
+            raise KervError("OpenVLA checkpoints need the package tokenizers: pip install 'kerv[openvla]'") from error
+        try:
+            self.tokenizer = Tokenizer.from_file(str(path))
+        except Exception as error:
+            raise CheckpointError(f"{path} cannot be read ({str(error)[:120]}): copy it again") from error
         self.text, self.limit = PROMPTS[form], limit
-        self.tokenizer = _tokenizer_of(path)
         size = self.tokenizer.get_vocab_size(with_added_tokens=False)
         self.begin, self.boundary = map(self.tokenizer.token_to_id, (BEGIN, BOUNDARY))
         if size != shape.vocabulary or None in (self.begin, self.boundary):
@@ -167,7 +176,7 @@ class Prompter:
         Raises:
             UsageError: The prompt has too many ids. It is not cut, because a decisive word could be lost.
         """
-        ids: list[int] = self.tokenizer.encode(self.text.format(instruction.lower())).ids
+        ids: list[Any] = self.tokenizer.encode(self.text.format(instruction.lower())).ids
         if ids[:1] != [self.begin]:
             ids = [self.begin, *ids]
         if ids[-1] != self.boundary:
@@ -178,16 +187,3 @@ class Prompter:
                 "taken: shorten it, or import the checkpoint with more prompt_tokens"
             )
         return ids
-
-
-def _tokenizer_of(path: Path) -> Any:
-    if not path.is_file():
-        raise CheckpointError(f"no {TOKENIZER} in {path.parent}: copy the one that was published with the checkpoint")
-    try:
-        from tokenizers import Tokenizer
-    except ImportError as error:
-        raise KervError("OpenVLA checkpoints need the package tokenizers: pip install 'kerv[openvla]'") from error
-    try:
-        return Tokenizer.from_file(str(path))
-    except Exception as error:
-        raise CheckpointError(f"{path} cannot be read ({str(error)[:120]}): copy it again") from error

@@ -22,11 +22,9 @@ from torch import Tensor, nn
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import regular, sha256_of, visible
 from kerv_cli.targets.openvla.config import CONFIG, Shape
-from kerv_cli.targets.openvla.trunk import LanguageModel, quantise
-from kerv_cli.targets.openvla.vision import VisionBackbone, projector
+from kerv_cli.targets.openvla.network import OpenVLAModel, quantise
 
 Sizes = tuple[int, ...]
-SINGLE = "model.safetensors"
 PICKLED = (".bin", ".pt", ".pth", ".ckpt")
 LISTED = 3  # maximum number of tensors of each kind that an error message names
 
@@ -81,7 +79,7 @@ def open_shards(folder: Path) -> Shards:
     Raises:
         CheckpointError: The folder has no such files, or only pickled weights, or a file is damaged.
     """
-    files = [path for path in visible(folder) if path.suffix == ".safetensors"]
+    files = sorted(folder.glob("[!.]*.safetensors"))
     if not files:
         pickled = [path.name for path in visible(folder) if path.suffix in PICKLED]
         if pickled:
@@ -109,12 +107,8 @@ def check_layout(shapes: Mapping[str, Sizes], expected: Mapping[str, Sizes], whe
     Raises:
         CheckpointError: Tensors are missing, unknown or have a wrong shape. The message names up to three of each kind.
     """
-    missing, unknown, reshaped = [], [name for name in shapes if name not in expected], []
-    for name, size in expected.items():
-        if name not in shapes:
-            missing.append(name)
-        elif shapes[name] != size:
-            reshaped.append(f"{name} {shapes[name]}, not {size}")
+    missing, unknown = [n for n in expected if n not in shapes], [n for n in shapes if n not in expected]
+    reshaped = [f"{n} {shapes[n]}, not {size}" for n, size in expected.items() if shapes.get(n, size) != size]
     wrong = []
     for kind, names in (("missing", missing), ("unknown", unknown), ("of another shape", reshaped)):
         if names:
@@ -122,16 +116,6 @@ def check_layout(shapes: Mapping[str, Sizes], expected: Mapping[str, Sizes], whe
             wrong.append(f"{len(names)} {kind}: {listed}")
     if wrong:
         raise CheckpointError(f"the weights in {where} are not those of its {CONFIG}: {'; '.join(wrong)}")
-
-
-class OpenVLAModel(nn.Module):
-    """All modules of an OpenVLA. They have the names that published checkpoints use."""
-
-    def __init__(self, shape: Shape) -> None:
-        super().__init__()
-        self.vision_backbone = VisionBackbone(shape)
-        self.projector = projector(shape)
-        self.language_model = LanguageModel(shape.language)
 
 
 def layout(shape: Shape) -> dict[str, Sizes]:
@@ -142,9 +126,9 @@ def layout(shape: Shape) -> dict[str, Sizes]:
 
 def is_unread(name: str, shape: Shape) -> bool:
     """Return whether a tensor has no effect, because it is in a tower's last block, final norm or pooling head."""
-    first, second = (tower.depth - 1 for tower in shape.towers)
-    parts = rf"(featurizer\.blocks\.{first}|fused_featurizer\.blocks\.{second}|\w+\.norm|\w+\.attn_pool)\."
-    return re.match(rf"vision_backbone\.{parts}", name) is not None
+    dino, siglip = shape.towers
+    last = rf"featurizer\.blocks\.{dino.depth - 1}|fused_featurizer\.blocks\.{siglip.depth - 1}"
+    return re.match(rf"vision_backbone\.({last}|\w+\.norm|\w+\.attn_pool)\.", name) is not None
 
 
 def sizes_of(module: nn.Module) -> dict[str, Sizes]:

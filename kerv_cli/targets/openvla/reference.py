@@ -15,12 +15,33 @@ from torch.nn.functional import gelu, linear
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder
-from kerv_cli.targets.openvla.config import read_shape
+from kerv_cli.targets.openvla.config import Tower, read_shape
 from kerv_cli.targets.openvla.inputs import pixels_of
-from kerv_cli.targets.openvla.loading import open_shards
+from kerv_cli.targets.openvla.loading import is_unread, open_shards
 
 SAMPLES = ("pick up the cup", "put the spoon on the towel", "open the drawer", "stack the blocks")
 """Instructions of the observations that are compared. Their images are noise."""
+_DINO = {
+    "blocks.": "encoder.layer.",
+    "attn.proj": "attention.o_proj",
+    "attn.qkv": "attention.qkv",
+    "ls1.scale_factor": "layer_scale1.lambda1",
+    "ls2.scale_factor": "layer_scale2.lambda1",
+    "cls_token": "embeddings.cls_token",
+    "reg_token": "embeddings.register_tokens",
+    "pos_embed": "embeddings.position_embeddings",
+    "patch_embed.proj": "embeddings.patch_embeddings.projection",
+}
+_SIGLIP = {
+    "blocks.": "encoder.layers.",
+    "attn.proj": "self_attn.out_proj",
+    "attn.qkv": "self_attn.qkv",
+    "norm1": "layer_norm1",
+    "norm2": "layer_norm2",
+    "pos_embed": "embeddings.position_embedding.weight",
+    "patch_embed.proj": "embeddings.patch_embedding",
+}
+"""Part of timm's name of a weight -> part of its name in transformers, for each tower."""
 
 
 def check_installed() -> None:
@@ -51,7 +72,7 @@ class Reference:
     def __init__(self, folder: Path, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
         check_installed()
         self.shape, self.device, self.dtype = read_shape(folder), device, dtype
-        self.state = dict(open_shards(folder).items())
+        self.state = {name: x for name, x in open_shards(folder).items() if not is_unread(name, self.shape)}
         self.dino, self.siglip, self.llama = self._dino(), self._siglip(), self._llama()
 
     def _part(self, prefix: str) -> dict[str, Tensor]:
@@ -66,56 +87,22 @@ class Reference:
         from transformers import Dinov2WithRegistersConfig, Dinov2WithRegistersModel
 
         tower = self.shape.towers[0]
-        config = Dinov2WithRegistersConfig(
-            hidden_size=tower.width,
-            num_hidden_layers=tower.depth - 1,  # OpenVLA takes the last but one
-            num_attention_heads=tower.heads,
-            mlp_ratio=tower.feed_forward // tower.width,
-            num_register_tokens=tower.registers,
-            image_size=tower.image,
-            patch_size=tower.patch,
-        )
-        own = self._part("vision_backbone.featurizer.")
-        weights = {
-            "embeddings.cls_token": own["cls_token"],
-            "embeddings.mask_token": torch.zeros(1, tower.width),
-            "embeddings.register_tokens": own["reg_token"],
-            # timm adds positions to the patches alone: transformers' class token gets a position of zero
-            "embeddings.position_embeddings": torch.cat([torch.zeros(1, 1, tower.width), own["pos_embed"]], 1),
-            "embeddings.patch_embeddings.projection.weight": own["patch_embed.proj.weight"],
-            "embeddings.patch_embeddings.projection.bias": own["patch_embed.proj.bias"],
-        }
-        names = {name: name for name in ("norm1", "norm2", "mlp.fc1", "mlp.fc2")}
-        names |= {"attn.proj": "attention.o_proj", "qkv": "attention"}
-        for i in range(tower.depth - 1):
-            layer = _block(own, f"blocks.{i}", names)
-            layer |= {f"layer_scale{n}.lambda1": own[f"blocks.{i}.ls{n}.scale_factor"] for n in (1, 2)}
-            weights |= {f"encoder.layer.{i}.{k}": v for k, v in layer.items()}
-        return self._loaded(Dinov2WithRegistersModel(config), weights)
+        hidden: Any = {"mlp_ratio": tower.feed_forward // tower.width, "num_register_tokens": tower.registers}
+        weights = _renamed(self._part("vision_backbone.featurizer."), _DINO)
+        # timm adds positions to the patches alone: transformers' class token gets a position of zero
+        nowhere = torch.zeros(1, 1, tower.width)
+        weights["embeddings.position_embeddings"] = torch.cat([nowhere, weights["embeddings.position_embeddings"]], 1)
+        weights["embeddings.mask_token"] = nowhere[0]
+        return self._loaded(Dinov2WithRegistersModel(Dinov2WithRegistersConfig(**hidden, **_sizes(tower))), weights)
 
     def _siglip(self) -> Any:
         from transformers import SiglipVisionConfig, SiglipVisionModel
 
         tower = self.shape.towers[1]
-        config = SiglipVisionConfig(
-            hidden_size=tower.width,
-            intermediate_size=tower.feed_forward,
-            num_hidden_layers=tower.depth - 1,
-            num_attention_heads=tower.heads,
-            image_size=tower.image,
-            patch_size=tower.patch,
-            hidden_act="gelu",  # timm's; transformers' own default is its tanh approximation
-        )
-        own = self._part("vision_backbone.fused_featurizer.")
-        weights = {
-            "embeddings.patch_embedding.weight": own["patch_embed.proj.weight"],
-            "embeddings.patch_embedding.bias": own["patch_embed.proj.bias"],
-            "embeddings.position_embedding.weight": own["pos_embed"][0],
-        }
-        names = {"norm1": "layer_norm1", "norm2": "layer_norm2", "mlp.fc1": "mlp.fc1", "mlp.fc2": "mlp.fc2"}
-        names |= {"attn.proj": "self_attn.out_proj", "qkv": "self_attn"}
-        for i in range(tower.depth - 1):
-            weights |= {f"encoder.layers.{i}.{k}": v for k, v in _block(own, f"blocks.{i}", names).items()}
+        # this GELU is timm's; transformers' own default is its tanh approximation
+        config = SiglipVisionConfig(intermediate_size=tower.feed_forward, hidden_act="gelu", **_sizes(tower))
+        weights = _renamed(self._part("vision_backbone.fused_featurizer."), _SIGLIP)
+        weights["embeddings.position_embedding.weight"] = weights["embeddings.position_embedding.weight"][0]
         return self._loaded(SiglipVisionModel(config), weights)
 
     def _llama(self) -> Any:
@@ -138,11 +125,6 @@ class Reference:
             x = gelu(x) if number < 3 else x
         return x
 
-    def prompt(self, pixels: Tensor, ids: list[int]) -> Tensor:
-        """Return the prompt (1, P, E) for an image (1, 6, s, s) and the ids of a text."""
-        words = self.llama.model.embed_tokens(torch.tensor([ids], device=self.device))
-        return torch.cat([words[:, :1], self.patches(pixels), words[:, 1:]], 1)
-
     @torch.inference_mode()
     def logits(self, pixels: Tensor, ids: list[int], following: list[int]) -> Tensor:
         """Return the logits after the prompt and after each of n following ids, in one forward.
@@ -155,30 +137,38 @@ class Reference:
         Returns:
             (n + 1, vocabulary).
         """
-        prompt = self.prompt(pixels, ids)
-        after = self.llama.model.embed_tokens(torch.tensor([following], dtype=torch.long, device=self.device))
-        found: Tensor = self.llama(inputs_embeds=torch.cat([prompt, after], 1)).logits[0, prompt.shape[1] - 1 :]
+        words = self.llama.model.embed_tokens(torch.tensor([[*ids, *following]], device=self.device))
+        x = torch.cat([words[:, :1], self.patches(pixels), words[:, 1:]], 1)
+        found: Tensor = self.llama(inputs_embeds=x).logits[0, -len(following) - 1 :]
         return found
 
 
-def _block(state: Mapping[str, Tensor], block: str, names: Mapping[str, str]) -> dict[str, Tensor]:
-    """Return a vision block's weights under transformers' names.
+def _sizes(tower: Tower) -> dict[str, Any]:
+    """Return the sizes that transformers' configurations of both towers have."""
+    image = {"image_size": tower.image, "patch_size": tower.patch}
+    layers = {"num_hidden_layers": tower.depth - 1}  # OpenVLA takes the last but one
+    return {"hidden_size": tower.width, "num_attention_heads": tower.heads, **layers, **image}
+
+
+def _renamed(weights: Mapping[str, Tensor], names: Mapping[str, str]) -> dict[str, Tensor]:
+    """Return a vision tower's weights under transformers' names, with queries, keys and values apart.
 
     Args:
-        state: Weights of the tower.
-        block: Name of the block.
-        names: Our name of a layer -> theirs. `qkv` is split into three.
+        weights: Weights of the tower.
+        names: Part of timm's name -> part of transformers' name.
     """
     found: dict[str, Tensor] = {}
-    for kind in ("weight", "bias"):
-        found |= {
-            f"{theirs}.{kind}": state[f"{block}.{ours}.{kind}"] for ours, theirs in names.items() if ours != "qkv"
-        }
-        split = zip("qkv", state[f"{block}.attn.qkv.{kind}"].chunk(3), strict=True)
-        found |= {f"{names['qkv']}.{part}_proj.{kind}": chunk for part, chunk in split}
+    for name, weight in weights.items():
+        for ours, theirs in names.items():
+            name = name.replace(ours, theirs)
+        if "qkv" in name:
+            found |= zip([name.replace("qkv", f"{part}_proj") for part in "qkv"], weight.chunk(3), strict=True)
+        else:
+            found[name] = weight
     return found
 
 
+@torch.inference_mode()
 def parity(target: Any) -> dict[str, float]:
     """Decode sample observations, and compare each token and its logits with those of the transformers package.
 
@@ -200,42 +190,30 @@ def parity(target: Any) -> dict[str, float]:
     Raises:
         UsageError: transformers is not installed.
     """
-    reference = Reference(Path(target.settings.checkpoint), target.device, target.dtype)
-    last, size = target.shape.vocabulary, target.settings.image_size
-    compared = differing = at_ties = ties = elsewhere = 0
-    worst = 0.0
+    reference, settings = Reference(Path(target.settings.checkpoint), target.device, target.dtype), target.settings
+    last, size = target.shape.vocabulary, settings.image_size
+    tokens, own, theirs = [], [], []
     for seed, instruction in enumerate(SAMPLES):
         image = np.random.default_rng(seed).integers(0, 256, (size, size, 3), dtype=np.uint8)
         observation = Observation(np.zeros(0), np.zeros(0), instruction, {target.cameras[0]: image})
-        tokens = Decoder(target).decode(observation).tokens
-        chosen = target.settings
-        pixels = pixels_of(image, target.shape, target.normalisations, chosen.crop, chosen.libero)
-        ids = [last - 1 - token for token in tokens]
-        logits = reference.logits(pixels, target.prompter.ids(instruction), ids[:-1]).float()
-        theirs = logits[:, last - target.shape.bins : last].flip(-1)
-        own = _own_logits(target, observation, tokens)
-        first, second = own.bfloat16().topk(2).values.unbind(-1)
-        tied = first == second
-        differs = theirs.argmax(-1) != torch.tensor(tokens, device=theirs.device)
-        compared, differing = compared + len(tokens), differing + int(differs.sum())
-        ties, at_ties = ties + int(tied.sum()), at_ties + int((tied & differs).sum())
-        elsewhere += int((logits.argmax(-1) < last - target.shape.bins).sum() + (logits.argmax(-1) >= last).sum())
-        worst = max(worst, float((own - theirs).abs().max()))
+        decoded = torch.tensor(Decoder(target).decode(observation).tokens, device=target.device)
+        prompt = target.encode(observation)
+        x = torch.cat([prompt, target.embed(decoded[None, :-1])], 1)
+        hidden = target.forward(x, torch.arange(x.shape[1], device=target.device))
+        pixels = pixels_of(image, target.shape, target.normalisations, settings.crop, settings.libero)
+        following = (last - 1 - decoded[:-1]).tolist()
+        tokens.append(decoded)
+        own.append(target.head(hidden[0, prompt.shape[1] - 1 :]).float())
+        theirs.append(reference.logits(pixels, target.prompter.ids(instruction), following).float())
+    chosen, logits, all_logits = torch.cat(tokens), torch.cat(own), torch.cat(theirs)
+    of_actions = all_logits[:, last - target.shape.bins : last].flip(-1)
+    first, second = logits.bfloat16().topk(2).values.unbind(-1)
+    ties, differs, best = first == second, of_actions.argmax(-1) != chosen, all_logits.argmax(-1)
     return {
-        "tokens compared with transformers": compared,
-        "tokens that differ": differing,
-        "of these where two logits tie in bfloat16": at_ties,
-        "ties of the two largest logits in bfloat16": ties,
-        "tokens where transformers chooses no action": elsewhere,
-        "largest difference of logits": worst,
+        "tokens compared with transformers": len(chosen),
+        "tokens that differ": int(differs.sum()),
+        "of these where two logits tie in bfloat16": int((ties & differs).sum()),
+        "ties of the two largest logits in bfloat16": int(ties.sum()),
+        "tokens where transformers chooses no action": int(((best < last - target.shape.bins) | (best >= last)).sum()),
+        "largest difference of logits": float((logits - of_actions).abs().max()),
     }
-
-
-@torch.inference_mode()
-def _own_logits(target: Any, observation: Observation, tokens: tuple[int, ...]) -> Tensor:
-    """Return the target's logits (N, V) before each of N tokens, in one forward."""
-    prompt = target.encode(observation)
-    x = torch.cat([prompt, target.embed(torch.tensor([tokens[:-1]], device=target.device))], 1)
-    hidden = target.forward(x, torch.arange(x.shape[1], device=target.device))
-    logits: Tensor = target.head(hidden[0, prompt.shape[1] - 1 :]).float()
-    return logits

@@ -12,12 +12,10 @@ per side of an image.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -28,6 +26,7 @@ from kerv_cli.base.manifests import read
 from kerv_cli.base.paths import artifact
 from kerv_cli.base.runtime import DTYPES, set_up
 from kerv_cli.base.spaces import Observation, ObservationSpace
+from kerv_cli.engine.protocol import Seen
 from kerv_cli.engine.transfer import upload
 from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.checkpoint import FORMAT, TargetDescription, load_target, target_fields
@@ -85,26 +84,15 @@ class OpenVLATarget:
         self.model = model = load_model(source, shape, device, dtype, settings.int8)
         self.chunk, self.width = settings.chunk, shape.language.hidden_size
         self.heads, self.feed_forward = shape.language.num_attention_heads, shape.language.intermediate_size
-        self.max_prompt = shape.patches + settings.prompt_tokens
+        self.max_prompt, self.pooled_width = shape.patches + settings.prompt_tokens, 2 * self.width
+        # instructions differ in length, so the instruction's slice has no end
+        begin, vision = slice(0, 1), slice(1, 1 + shape.patches)
+        self.segments = {"begin": begin, "vision": vision, "instruction": slice(vision.stop, None)}
         last = shape.vocabulary
         self.action_rows = model.language_model.lm_head.weight[last - shape.bins : last].flip(0).contiguous()
         self.layers = model.language_model.model.layers
         self.device, self.dtype = self.action_rows.device, self.action_rows.dtype
         self.words = functools.lru_cache(maxsize=64)(self._words)
-
-    @property
-    def segments(self) -> Mapping[str, slice]:
-        """Map from the name of each part of the prompt to the positions of its tokens (a slice).
-
-        The instruction's slice has no end, because instructions differ in length.
-        """
-        patches = self.shape.patches
-        return {"begin": slice(0, 1), "vision": slice(1, 1 + patches), "instruction": slice(1 + patches, None)}
-
-    @property
-    def pooled_width(self) -> int:
-        """F, number of values that `pooled` returns per prompt."""
-        return 2 * self.width
 
     def pooled(self, prompt: Tensor) -> Tensor:
         """Pool each prompt (B, P, E) into one vector (B, F): the mean vision token, then the mean text token."""
@@ -121,13 +109,10 @@ class OpenVLATarget:
         if camera not in observation.images:
             raise CheckpointError(f"the target sees camera '{camera}', whose image was not drawn")
         image, settings = observation.images[camera], self.settings
-        patches = self.see(pixels_of(image, self.shape, self.normalisations, settings.crop, settings.libero))
+        pixels = pixels_of(image, self.shape, self.normalisations, settings.crop, settings.libero)
+        patches = self.model.projector(self.model.vision_backbone(upload(pixels, self.device).to(self.dtype)))
         words = self.words(observation.instruction)
         return torch.cat([words[:, :1], patches, words[:, 1:]], 1)
-
-    def see(self, pixels: Tensor) -> Tensor:
-        """Map images from `pixels_of`, (B, 6, s, s), to n vision tokens per image, (B, n, E)."""
-        return self.model.projector(self.model.vision_backbone(upload(pixels, self.device).to(self.dtype)))
 
     def _words(self, instruction: str) -> Tensor:
         ids = upload([self.prompter.ids(instruction)], self.device)
@@ -148,17 +133,8 @@ class OpenVLATarget:
         fixed = self.action_rows.is_cuda if fixed is None else fixed
         return Cache(*self.shape.language.cache_sizes(batch, capacity), self.action_rows, fixed)
 
-    def forward(
-        self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
-    ) -> Tensor:
-        """Run all layers over T new tokens, and return their hidden states (B, T, E).
-
-        Args:
-            x: (B, T, E) embeddings of the new tokens.
-            positions: (T,) rotary positions of the new tokens.
-            cache: Keys and values of earlier tokens. This forward appends the new ones. None: no earlier tokens.
-            seen: (T, M) bool, which of the last M tokens, old or new, each new token attends to. None: causal mask.
-        """
+    def forward(self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: Seen = None) -> Tensor:
+        """Return the hidden states (B, T, E) of embeddings x (B, T, E). `Target.forward` explains the arguments."""
         return self.model.language_model.model(x, positions, cache, seen)
 
     def head(self, hidden: Tensor) -> Tensor:
@@ -257,11 +233,8 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
     described = {"format": FORMAT, "kind": "target", "sha256": digest_of(hashes, chosen), **fields}
     write_json(folder / "target.json", described)
     sizes = {"prompt tokens": shape.patches + len(prompt), "action tokens": actions.tokens, "DoFs": actions.dofs}
-    return folder, {"parameters": parameters, **sizes, **(_parity(folder, settings) if settings.check else {})}
-
-
-def _parity(folder: Path, settings: BuildTargetSettings) -> dict[str, float]:
-    """Return how the target compares with transformers, by name (`reference.parity`)."""
-    device, _ = set_up(settings.runtime)
-    target: Any = load_target(folder, device, DTYPES[settings.runtime.dtype])[0]
-    return parity(target)
+    compared = {}
+    if settings.check:
+        device, _ = set_up(settings.runtime)
+        compared = parity(load_target(folder, device, DTYPES[settings.runtime.dtype])[0])
+    return folder, {"parameters": parameters, **sizes, **compared}

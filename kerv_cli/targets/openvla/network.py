@@ -1,26 +1,31 @@
-"""The language model of OpenVLA: Llama-2 with tree attention over a key/value cache.
+"""The network of OpenVLA: two vision towers, a projector, and Llama-2 with tree attention over a key/value cache.
 
-Modules have the names that published checkpoints use, so that their weights can be memory-mapped.
+Modules have the names that published checkpoints use, so that their weights can be memory-mapped. Weights without
+effect are left out: the last block of each tower (OpenVLA takes the output of the last but one), the norm after it and
+SigLIP's pooling head.
 
-Shapes: B batch, T new tokens, S cached tokens, E width, A heads, K heads of keys and values, C channels of a head.
+Shapes: B batch, T new tokens, S cached tokens, E width of the language model, A heads, K heads of keys and values, C
+channels of a head; h × w pixels of an image, n patches, W width of a tower.
 """
 
 from __future__ import annotations
 
-import numpy as np
+from collections import OrderedDict
+from functools import partial
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.targets.attention import Cache, Slots, attend, attention_mask, rotate
-from kerv_cli.targets.openvla.config import Language
+from kerv_cli.engine.protocol import Seen
+from kerv_cli.targets.attention import Cache, Rotation, Slots, attend, attention_mask, rotate
+from kerv_cli.targets.openvla.config import Language, Shape, Tower
 
-Rotary = tuple[Tensor, Tensor]
-"""Cosines and sines (T, C) of the rotary embedding."""
+EPSILON = 1e-6  # of every layer norm
 
 
-def rotation(positions: Tensor, channels: int, theta: float, dtype: torch.dtype) -> Rotary:
-    """Return the cosines and sines of the rotary embedding in half-split layout. They are computed in float32.
+def rotation(positions: Tensor, channels: int, theta: float, dtype: torch.dtype) -> Rotation:
+    """Return the cosines and sines (T, C) of the rotary embedding in half-split layout. They are computed in float32.
 
     In the first half of the channels the sines have the reversed sign, as `attention.rotate` requires.
 
@@ -49,7 +54,7 @@ class LlamaAttention(nn.Module):
         self.o_proj = nn.Linear(width, width, bias=False)
 
     def forward(
-        self, x: Tensor, rotary: Rotary, mask: Tensor | None, cache: Tensor | None = None, slots: Slots | None = None
+        self, x: Tensor, rotary: Rotation, mask: Tensor | None, cache: Tensor | None = None, slots: Slots = None
     ) -> Tensor:
         """Return the attention's output (B, T, E).
 
@@ -98,7 +103,7 @@ class LlamaLayer(nn.Module):
         self.mlp = LlamaPerceptron(language)
 
     def forward(
-        self, x: Tensor, rotary: Rotary, mask: Tensor | None, cache: Tensor | None = None, slots: Slots | None = None
+        self, x: Tensor, rotary: Rotation, mask: Tensor | None, cache: Tensor | None = None, slots: Slots = None
     ) -> Tensor:
         """Return the layer's output (B, T, E) for x (B, T, E). `LlamaAttention.forward` explains the arguments."""
         x = x + self.self_attn(self.input_layernorm(x), rotary, mask, cache, slots)
@@ -106,13 +111,7 @@ class LlamaLayer(nn.Module):
 
 
 def run_layers(
-    layers: nn.ModuleList,
-    language: Language,
-    x: Tensor,
-    positions: Tensor,
-    cache: Cache | None,
-    seen: np.ndarray | Tensor | None,
-    mask: Tensor | None = None,
+    layers: nn.ModuleList, language: Language, x: Tensor, positions: Tensor, cache: Cache | None, mask: Tensor | None
 ) -> Tensor:
     """Run all layers over T new tokens, and return the output (B, T, E) of the last layer.
 
@@ -122,11 +121,9 @@ def run_layers(
         x: (B, T, E) embeddings of the new tokens.
         positions: (T,) rotary positions of the new tokens.
         cache: Keys and values of earlier tokens. This forward appends the new ones. None: no earlier tokens.
-        seen: (T, M) bool, which of the last M tokens, old or new, each new token attends to. None: causal mask.
-        mask: Additive mask to use instead of `seen`. None: the mask is made from `seen`.
+        mask: Result of `attention_mask`. None: attention is causal.
     """
     rotary = rotation(positions, language.channels, language.rope_theta, x.dtype)
-    mask = attention_mask(seen, x.shape[1], cache, x) if mask is None else mask
     slots = cache.next_slots(x.shape[1]) if cache is not None else None
     for i, layer in enumerate(layers):
         x = layer(x, rotary, mask, cache.layers[i] if cache is not None else None, slots)
@@ -145,11 +142,10 @@ class LlamaModel(nn.Module):
         self.layers = nn.ModuleList(LlamaLayer(language) for _ in range(language.num_hidden_layers))
         self.norm = nn.RMSNorm(language.hidden_size, eps=language.rms_norm_eps)
 
-    def forward(
-        self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: np.ndarray | Tensor | None = None
-    ) -> Tensor:
-        """Return the hidden states (B, T, E) of embeddings x (B, T, E). `run_layers` explains the arguments."""
-        return self.norm(run_layers(self.layers, self.language, x, positions, cache, seen))
+    def forward(self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: Seen = None) -> Tensor:
+        """Return the hidden states (B, T, E) of embeddings x (B, T, E). `Target.forward` explains the arguments."""
+        mask = attention_mask(seen, x.shape[1], cache, x)
+        return self.norm(run_layers(self.layers, self.language, x, positions, cache, mask))
 
 
 class LanguageModel(nn.Module):
@@ -159,6 +155,116 @@ class LanguageModel(nn.Module):
         super().__init__()
         self.model = LlamaModel(language)
         self.lm_head = nn.Linear(language.hidden_size, language.vocab_size, bias=False)
+
+
+def named(**layers: nn.Module) -> nn.Sequential:
+    """Return the layers in sequence. Each keyword names its layer, and so the layer's weights."""
+    return nn.Sequential(OrderedDict(layers))
+
+
+class Attention(nn.Module):
+    """Self-attention with one projection for queries, keys and values."""
+
+    def __init__(self, tower: Tower) -> None:
+        super().__init__()
+        self.heads = tower.heads
+        self.qkv = nn.Linear(tower.width, 3 * tower.width)
+        self.proj = nn.Linear(tower.width, tower.width)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the attention's output (B, n, W) for x (B, n, W)."""
+        batch, tokens, width = x.shape
+        q, k, v = self.qkv(x).view(batch, tokens, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
+        attended = F.scaled_dot_product_attention(q, k, v)
+        return self.proj(attended.transpose(1, 2).reshape(batch, tokens, width))
+
+
+class LayerScale(nn.Module):
+    """A learned factor per channel."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.scale_factor = nn.Parameter(torch.ones(width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Multiply each channel of x (B, n, W) by its factor."""
+        return x * self.scale_factor
+
+
+class Block(nn.Module):
+    """Pre-norm transformer block."""
+
+    def __init__(self, tower: Tower) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(tower.width, eps=EPSILON)
+        self.attn = Attention(tower)
+        self.norm2 = nn.LayerNorm(tower.width, eps=EPSILON)
+        # the exact GELU in both towers, as in timm; the SigLIP of transformers approximates it
+        width, hidden = tower.width, tower.feed_forward
+        self.mlp = named(fc1=nn.Linear(width, hidden), gelu=nn.GELU(), fc2=nn.Linear(hidden, width))
+        scale = partial(LayerScale, tower.width) if tower.scaled else nn.Identity
+        self.ls1, self.ls2 = scale(), scale()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the block's output (B, n, W) for x (B, n, W)."""
+        x = x + self.ls1(self.attn(self.norm1(x)))
+        return x + self.ls2(self.mlp(self.norm2(x)))
+
+
+class VisionTower(nn.Module):
+    """One vision tower, without its last block."""
+
+    def __init__(self, tower: Tower) -> None:
+        super().__init__()
+        self.prefix = tower.prefix
+        if tower.scaled:
+            self.cls_token = nn.Parameter(torch.zeros(1, 1, tower.width))
+            self.reg_token = nn.Parameter(torch.zeros(1, tower.registers, tower.width))
+        self.pos_embed = nn.Parameter(torch.zeros(1, tower.patches, tower.width))
+        self.patch_embed = named(proj=nn.Conv2d(3, tower.width, tower.patch, stride=tower.patch))
+        self.blocks = nn.ModuleList(Block(tower) for _ in range(tower.depth - 1))
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """Map normalised images (B, 3, h, w) to patch tokens (B, n, W).
+
+        Position embeddings are added to patches only, not to the class token and the registers.
+        """
+        x = self.patch_embed(pixels).flatten(2).transpose(1, 2) + self.pos_embed
+        if self.prefix:
+            front = torch.cat([self.cls_token, self.reg_token], 1).expand(len(x), -1, -1)
+            x = torch.cat([front, x], 1)
+        for block in self.blocks:
+            x = block(x)
+        return x[:, self.prefix :]
+
+
+class VisionBackbone(nn.Module):
+    """Both vision towers. Their outputs are concatenated."""
+
+    def __init__(self, shape: Shape) -> None:
+        super().__init__()
+        self.featurizer, self.fused_featurizer = (VisionTower(tower) for tower in shape.towers)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """Map images (B, 6, h, w), three channels for each tower, to patch tokens (B, n, sum of both widths)."""
+        return torch.cat([self.featurizer(pixels[:, :3]), self.fused_featurizer(pixels[:, 3:])], -1)
+
+
+def projector(shape: Shape) -> nn.Sequential:
+    """Return the layers that map patch tokens (B, n, both towers' widths) to the language model's tokens (B, n, E)."""
+    width, hidden = sum(tower.width for tower in shape.towers), shape.language.hidden_size
+    first, second, third = nn.Linear(width, 4 * width), nn.Linear(4 * width, hidden), nn.Linear(hidden, hidden)
+    return named(fc1=first, gelu1=nn.GELU(), fc2=second, gelu2=nn.GELU(), fc3=third)
+
+
+class OpenVLAModel(nn.Module):
+    """All modules of an OpenVLA. They have the names that published checkpoints use."""
+
+    def __init__(self, shape: Shape) -> None:
+        super().__init__()
+        self.vision_backbone = VisionBackbone(shape)
+        self.projector = projector(shape)
+        self.language_model = LanguageModel(shape.language)
 
 
 class Int8Linear(nn.Module):
