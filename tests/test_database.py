@@ -564,6 +564,7 @@ def test_a_store_is_used_by_one_command_and_no_password_is_kept(tmp_path, monkey
     monkeypatch.delenv(STORE, raising=False)
     url, where = f"sqlite:///{tmp_path}/other.db", f"results={tmp_path}"
     other = Database(tmp_path, url)
+    assert other.words == [where, f"store={url}"]  # a suggested command works as it is printed
     (tmp_path / "artifacts/target/openvla").mkdir(parents=True)  # without a folder the command would leave no row
     told("build", "target", f"checkpoint={tmp_path}", f"store={url}", where, code=1)
     assert [row.status for row in run_rows(other)] == ["failed"]

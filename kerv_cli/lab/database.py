@@ -249,7 +249,8 @@ class Database:
         Empty for the SQLite file in the folder `results`.
         """
         folder = [] if self.results == results_dir("results") else [f"results={self.results}"]
-        return folder + ([f"store={self.shown}"] if self.store else [])
+        url = self._url.render_as_string() if self.file else self.shown
+        return folder + ([f"store={url}"] if self.store else [])
 
     @property
     def exists(self) -> bool:
