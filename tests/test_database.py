@@ -542,6 +542,8 @@ def test_a_name_in_use_is_refused_and_a_killed_command_is_listed_with_how_to_go_
     assert again in told("runs", "rerun", "demos/mine", f"results={tmp_path}", code=2)
     place.mkdir(parents=True)
     (place / "recording.json").write_text("{}")
+    plan = told("demos", "name=mine", "task=reach", "--plan", f"results={tmp_path}", code=2)
+    assert "holds demonstrations with format=None" in plan
     with pytest.raises(CheckpointError, match=again):
         open_demos(Database(tmp_path), "mine")
     told("runs", "rm", "demos/mine", "--yes", f"results={tmp_path}")

@@ -26,11 +26,12 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
         kerv demos name=visited policy=vision task=reach --plan
     """
     from kerv_cli.training.demonstrations import name_of, recording_of
-    from kerv_cli.worlds.demos.recording import record
+    from kerv_cli.worlds.demos.recording import check_recording, record
 
     config, actor = recording_of(settings)
     config.spec.check_installed()
     folder = artifact(settings.results, "demos", settings.name or name_of(settings.task))
+    check_recording(config, folder)
     what = f"{count(len(config.tasks), 'task')} x {count(settings.episodes, 'episode')} -> {folder}"
     try:
         with as_planned(settings, plan) as (_, begin):

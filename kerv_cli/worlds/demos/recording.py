@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
-from kerv_cli.base.files import read_json, write_json
+from kerv_cli.base.files import read_mapping, write_json
 from kerv_cli.base.limits import check_settings, limits, number
 from kerv_cli.base.manifests import read
 from kerv_cli.base.processes import Workers
@@ -189,8 +189,9 @@ def record(
     """
     config.spec.check_installed()
     choose_backend()
-    identity = _identity(config)
-    _check_same_recording(out, identity, config.spec.packages)
+    identity, begun = check_recording(config, out), out / "recording.json"
+    if not begun.exists():
+        write_json(begun, identity)
     entries, failed = _collect(config, out, on_progress, make_actor)
     empty = [task for task, rows in entries.items() if not rows]
     if empty:
@@ -252,32 +253,34 @@ def _identity(config: DemoConfig) -> dict[str, Any]:
     return dict(json.loads(json.dumps(identity)))  # turns tuples into lists, as in the file
 
 
-def _check_same_recording(out: Path, identity: dict[str, Any], packages: Sequence[str]) -> None:
-    """Write `recording.json`, or check that the folder's recording has the same configuration.
+def check_recording(config: DemoConfig, out: Path) -> dict[str, Any]:
+    """Refuse a folder that holds demonstrations of another configuration.
 
     Args:
-        out: The dataset's folder.
-        identity: The configuration, from `_identity`.
-        packages: Packages whose versions must be the same.
+        config: What to record.
+        out: The dataset's folder. It need not exist.
+
+    Returns:
+        The manifest's fields that are known before the recording, as JSON values.
 
     Raises:
         UsageError: The folder holds demonstrations of another configuration.
     """
-    path = out / "recording.json"
-    if not path.exists():
-        write_json(path, identity)
 
     def flat(one: dict[str, Any]) -> dict[str, Any]:
         # Another Python or numpy may resume a recording. Another simulator version may have other physics.
-        return {**one, **one["config"], **{name: one["versions"].get(name) for name in packages}, "versions": {}}
+        versions = one.get("versions", {})
+        return {**one, **one.get("config", {}), **{name: versions.get(name) for name in packages}, "versions": {}}
 
-    new, old = flat(identity), flat(read_json(path))
+    identity, packages, path = _identity(config), config.spec.packages, out / "recording.json"
+    new, old = flat(identity), flat(read_mapping(path) if path.exists() else identity)
     for key in [*new, *old]:
         if key != "config" and new.get(key) != old.get(key):
             raise UsageError(
                 f"{out} holds demonstrations with {key}={old.get(key)}, not {new.get(key)}: "
                 "give these another name=; demos=A+B joins both"
             )
+    return identity
 
 
 _Outcomes = dict[int, EpisodeEntry | None]  # seed -> the manifest's entry, None if the expert failed
