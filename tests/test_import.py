@@ -46,6 +46,9 @@ def test_an_exported_database_is_the_study_elsewhere(made, tmp_path):
     assert (run["id"], run["state"]) == ("threshold", "complete")
     told = answer("runs", "import", f"{tmp_path}/out/threshold/kerv.db", "name=copy", f"results={tmp_path}/new")
     assert told == {"studies": ["copy"], "notes": []}
+    again = kerv("runs", "import", f"{tmp_path}/out/threshold", "name=copy", f"results={tmp_path}/new").stdout
+    assert f"'kerv runs rm copy results={tmp_path}/new' removes it" in again
+    assert f"'kerv runs list results={tmp_path}/new'" in again
     before, after = (
         load_study(Study(opened(folder), name)) for folder, name in ((made, "threshold"), (tmp_path / "new", "copy"))
     )

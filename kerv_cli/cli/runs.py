@@ -27,6 +27,7 @@ from kerv_cli.cli.common import (
     print_rows,
     print_table,
     results_word,
+    with_results,
 )
 
 if TYPE_CHECKING:
@@ -323,7 +324,7 @@ class ImportSettings(CommandSettings):
 
 
 @command("runs import", ImportSettings, keys="name baseline labels results")
-def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False) -> None:
+def import_(settings: ImportSettings, names: list[str], overrides: list[str], as_json: AsJson = False) -> None:
     """Import the runs of another results folder, or evaluations of vla-eval as a study.
 
     NAME: a kerv.db, vla-eval's recording-….sqlite, or folders that hold one.
@@ -349,8 +350,8 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
         studies, notes = import_databases(database, files, settings.name)
         if as_json:
             end_with_json({"studies": studies, "notes": notes})
-        for line in [*notes, f"imported {', '.join(studies) or 'nothing'}: kerv runs list"]:
-            typer.echo(line)
+        for line in [*notes, f"imported {', '.join(studies) or 'nothing'}: 'kerv runs list' shows what is there"]:
+            typer.echo(with_results(line, overrides))
         return
     words = ["runs", "import", *names]
     name, notes = import_evaluations(database, paths, settings.name, settings.labels, settings.baseline, words)
@@ -360,4 +361,5 @@ def import_(settings: ImportSettings, names: list[str], as_json: AsJson = False)
     for line in notes:
         typer.echo(line)
     console().print(SummaryTable(data.results))
-    typer.echo(f"study {name}: kerv report study={name}, kerv report --choose study={name}")
+    report = f"kerv report study={name}{results_word(overrides)}"
+    typer.echo(f"study {name}: {report}, {report} --choose")
