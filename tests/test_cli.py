@@ -305,6 +305,7 @@ FILES = {
     "radius.yaml": "settings:\n  ar: method=ar\n  a: method=spec_vla threshold.radius=3\n",
     "nested.yaml": "settings:\n  ar:\n    method: ar\n",
     "axis.yaml": "axis: threshold.rr\nsettings:\n  ar: method=ar\n  a: method=spec_vla threshold.r=3,9\n",
+    "no_axis.yaml": "axis: threshold.rr\nsettings: {ar: method=ar}",
     "twice.yaml": "settings:\n  ar: method=ar\n  ar: method=kerv\n",
     "part.yaml": "# a comment\nproposer: draftr\n",
     "hydra.yaml": "defaults:\n  - override /proposer: drafter\n",
@@ -384,6 +385,7 @@ ANSWERS = [
     # studies
     ("sweep study=typo.yaml", "typo.yaml:1: unknown key 'study.setings': did you mean study.settings"),
     ("sweep study=no_baseline.yaml", "study 'no_baseline' has no setting 'ar', the baseline that its others are"),
+    ("sweep study=no_baseline.yaml", "or name one of these by study.baseline=: "),
     ("sweep study=empty.yaml", "study 'empty' has no settings: see conf/study/demo.yaml"),
     ("sweep study=list.yaml", "study=list.yaml holds no keys: write key: value"),
     ("sweep study=tabs.yaml", "tabs.yaml:2: it is not YAML"),
@@ -392,6 +394,7 @@ ANSWERS = [
     ("sweep study=radius.yaml", "radius.yaml:3: unknown key 'threshold.radius': did you mean threshold"),
     ("sweep study=nested.yaml", "nested.yaml:1: study.settings={'ar': {'method': 'ar'}}: every element must be"),
     ("sweep study=axis.yaml", "axis.yaml:1: unknown axis 'threshold.rr': did you mean threshold.r?"),
+    ("sweep study=no_axis.yaml", "no_axis.yaml:1: unknown axis 'threshold.rr': there is none"),
     ("sweep study=twice.yaml", "twice.yaml:3: settings.ar is given twice, also in line 2"),
     ("sweep study=demo method=ar", "study 'demo' sets method itself: leave it out"),
     ("sweep threshold.r=1,2,3", "of which study? name one, study=NAME: 'kerv sweep' lists them; 'kerv rollout -m'"),

@@ -56,7 +56,7 @@ class UnknownName(UsageError):
 
     def __init__(self, kind: str, name: str, names: Iterable[str]) -> None:
         names = list(names)
-        hint = did_you_mean(name, names) or f"known: {', '.join(names)}"
+        hint = did_you_mean(name, names) or (f"known: {', '.join(names)}" if names else "there is none")
         super().__init__(f"unknown {kind} '{name}': {hint}", kind)
 
 

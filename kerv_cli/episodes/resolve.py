@@ -154,7 +154,7 @@ def _points(study: StudySettings, path: Path, typed: Collection[str]) -> dict[st
     if study.baseline not in points:
         raise UsageError(
             f"study '{study.name}' has no setting '{study.baseline}', the baseline that its others are "
-            f"compared with: add it, or name one of these by baseline=: {', '.join(points)}"
+            f"compared with: add it, or name one of these by study.baseline=: {', '.join(points)}"
         )
     return points
 
