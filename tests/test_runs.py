@@ -70,6 +70,8 @@ def test_runs_are_viewed_by_their_ids_and_last_is_the_newest_with_recordings(pol
     assert works("view", jacobi, results) == works("view", str(one))
     assert "no recordings in" in kerv("view", "target/nano-state", results, code=2).stderr
     assert "unknown run 'nobodys'" in kerv("view", "nobodys", results, code=2).stderr
+    shutil.rmtree(tmp_path / "results/rollouts" / jacobi)
+    assert "no recordings in" in kerv("view", jacobi, results, code=2).stderr
     assert "nobodys/either does not exist" in kerv("view", "nobodys/either", results, code=2).stderr
 
 

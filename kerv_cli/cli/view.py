@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from kerv_cli.base.errors import UnknownName
+from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import database_of
@@ -36,13 +36,13 @@ def _place(settings: CommandSettings, name: str) -> Path:
         name: A path, the name of a run, or `last`: the newest run that has recordings.
 
     Raises:
-        UsageError: There is neither such a path nor such a run.
+        UsageError: There is neither such a path nor such a run, or the run has no folder.
     """
     path = Path(name).expanduser()
     if path.exists() or path.suffix == ".rrd":
         return path
     from kerv_cli.catalogue.entries import LAST, find_run, find_runs
-    from kerv_cli.report.viewing.viewer import recordings_below
+    from kerv_cli.report.viewing.viewer import NO_RECORDINGS, recordings_below
 
     database = database_of(settings)
     if name == LAST:
@@ -51,8 +51,11 @@ def _place(settings: CommandSettings, name: str) -> Path:
                 return run.folder
         return Path(settings.results)
     try:
-        return find_run(database, name).folder
+        folder = find_run(database, name).folder
     except UnknownName:
         if len(path.parts) > 1:
             return path
         raise
+    if not folder.is_dir():
+        raise UsageError(NO_RECORDINGS.format(folder))
+    return folder

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 MOST_OPENED = 16
 """Largest number of recordings that one command opens. More would fill the viewer's memory."""
+NO_RECORDINGS = "no recordings in {}: make some with 'kerv rollout method=ar task=reach-v3'"
 _START_SECONDS = 2.0
 
 
@@ -48,7 +49,7 @@ def find_recordings(paths: Iterable[Path]) -> list[Path]:
             raise UsageError(f"{path} does not exist or is no recording: name a file that ends in .rrd, or a folder")
     if not found:
         where = ", ".join(map(str, paths)) or "the results folder"
-        raise UsageError(f"no recordings in {where}: make some with 'kerv rollout method=ar task=reach-v3'")
+        raise UsageError(NO_RECORDINGS.format(where))
     return sorted(found, key=lambda path: (-path.stat().st_mtime, path))
 
 
