@@ -221,7 +221,7 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
         raise UnknownName("kind of run", filters["kind"], kinds)
     state, since, task = filters.get("state", ""), filters.get("since", ""), filters.get("task", "*")
     if not any(one.startswith(state) or state.startswith(one) for one in _STATES) and not state[:1].isdigit():
-        raise UnknownName("state", state, _STATES)
+        raise UnknownName("state", state, [*map(str.strip, _STATES), "2 of 6 episodes"])
     if since and not re.fullmatch(r"\d{4}(-\d\d){0,2}(T.*)?", since):
         raise UsageError(f"since={since} is not a date: write 2026-11-23 or 2026-11-23T14:00")
 

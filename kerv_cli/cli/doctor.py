@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import typer
 
+from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UnknownName
 from kerv_cli.base.files import visible
 from kerv_cli.base.limits import number, setting
@@ -152,7 +153,7 @@ def _torch(settings: DoctorSettings) -> str:
 
     device, _ = set_up(settings.runtime)
     cuda = "CUDA available" if torch.cuda.is_available() else "no CUDA device"
-    return f"{device}: {device_name(device)}, {torch.get_num_threads()} thread(s), {cuda}"
+    return f"{device}: {device_name(device)}, {count(torch.get_num_threads(), 'thread')}, {cuda}"
 
 
 def _policy(name: str, settings: DoctorSettings) -> str:
