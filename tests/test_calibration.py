@@ -435,7 +435,9 @@ def test_the_skip_levels_belong_to_one_datastore(own):
     assert row.share > 0
     assert made.skip_levels("reach-v3", store.manifest.content) == (row.low, row.s_min, row.high)
     assert CalibrationArtifact().checked(path, described) == made
-    with pytest.raises(CheckpointError, match=r"for datastore \w+, not for eeeeeeeeeeee: run 'kerv calibrate' again"):
+    with pytest.raises(
+        CheckpointError, match=r"for datastore \w+, not for eeeeeeeeeeee: run 'kerv calibrate' again, with"
+    ):
         made.skip_levels("reach-v3", "e" * 64)
     with pytest.raises(CheckpointError, match="no skip level for push-v3, only for reach-v3, drawer-close-v3"):
         made.skip_levels("push-v3", store.manifest.content)
