@@ -176,7 +176,7 @@ def test_a_7b_on_every_device_in_a_second_without_torch():
             assert sum(part["ms"] for part in engine["parts"]) == pytest.approx(engine["ms"])
             for one in engine["families"]:
                 for speed in (one["at_published_acceptance"], one["at_own_acceptance"]):
-                    assert speed is None or one["method"] == "heisd" or speed <= one["ceiling"] * 1.001, one
+                    assert speed is None or speed <= one["ceiling"] * 1.001, one
     assert machines[0]["engines"][0]["parts"][2]["bound"] == "reading"
     assert machines[0]["engines"][1]["parts"][2]["bound"] == "launches"
 
@@ -186,7 +186,9 @@ def test_weights_alone_give_about_what_the_model_itself_gives():
     guessed, known = answer("weights=7.54B", "device=a100"), answer("model=openvla-7b", "device=a100")
     for engine in (0, 1):
         assert guessed["engines"][engine]["ms"] == pytest.approx(known["engines"][engine]["ms"], rel=0.1)
-        for one in known["engines"][engine]["families"][:5]:  # unverified drafts cost what one encoder or two towers do
+        for one in known["engines"][engine]["families"][:5]:
+            if one["method"] == "heisd":
+                continue  # unverified drafts cost what one encoder or two towers do
             assert family(guessed, one["method"], engine)["ceiling"] == pytest.approx(one["ceiling"], rel=0.1)
     assert any("assumed" in line and "layers" in line for line in guessed["notes"])
     assert not any("assumed" in line for line in known["notes"])

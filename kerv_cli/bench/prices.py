@@ -50,7 +50,12 @@ FAMILIES = (
     Family("drafter, chain", "spec_vla_tuned", Drafts(15)),
     Family("drafter, tree", "spec_vla", _TREE, length=(3.63 + 3.91) / 2, reported="1.22–1.42"),
     Family("tree, then prediction", "kerv", _TREE, reported="1.27–1.37 × naive SD"),
-    Family("retrieval, then tree", "heisd", replace(_TREE, source="retrieval", retrieved=1.0), reported="up to 2.45"),
+    Family(
+        "retrieval, then tree",
+        "heisd",
+        replace(_TREE, source="retrieval", retrieved=1.0, skipped=1.0),
+        reported="up to 2.45",
+    ),
     Family("one pass", "one_pass", Drafts(source="early", in_prefill=True)),
     Family("streak", "one_pass_streak", Drafts(15, source="early", in_prefill=True, skipped=1.0)),
     Family("unverified", "early_unverified", Drafts(source="early", skipped=1.0)),
