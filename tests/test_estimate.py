@@ -295,6 +295,13 @@ def test_wrong_words_are_refused(tmp_path):
         assert word.partition("=")[0] in refusal("estimate", *words, code=2)
     assert "no target" in refusal("estimate", "model=nothing", f"results={tmp_path}", code=2)
     assert "does not describe" in refusal("estimate", config(tmp_path / "x", vocab_size="many", hidden_size=8), code=1)
+    eye = {"hidden_size": 8, "num_hidden_layers": 2, "patch_size": 0}
+    for name, words in (
+        ("num_attention_heads", config(tmp_path / "x", **LLAMA | {"num_attention_heads": 0})),
+        ("patch_size", config(tmp_path / "y", **LLAMA, vision_config=eye)),
+    ):
+        assert f"does not describe a policy ({name}=0)" in refusal("estimate", words, code=1)
+    assert "leave out weights, vision" in refusal("estimate", "on=epyc-vla-150m", "weights=7B", "vision=8ms", code=2)
     (tmp_path / "config.json").write_text("{")
     assert "JSON" in refusal("estimate", f"model={tmp_path}", code=1)
 
@@ -468,7 +475,7 @@ def test_a_trace_that_cannot_be_answered_is_refused(tmp_path, swept_results):
     trace = write_trace(tmp_path / "t.jsonl", {"episode": "0", "tokens": 7, "rounds": [{}]})
     assert "no drafted chain" in refusal("estimate", f"trace={trace}", "model=openvla-7b", "choose=draft", code=2)
     assert "weights=7B" in refusal("estimate", f"trace={trace}", code=2)
-    assert "cannot be read" in refusal("estimate", f"trace={tmp_path / 'none'}", "weights=7B", code=1)
+    assert "cannot be read: No such" in refusal("estimate", f"trace={tmp_path / 'none'}", "weights=7B", code=1)
 
 
 def test_a_trace_that_a_profile_cannot_price_says_what_measures_the_cost(tmp_path):

@@ -163,28 +163,41 @@ def _of_config(settings: EstimateSettings, config: Mapping[str, Any], file: Path
     text = next((one for one in reversed(texts) if "vocab_size" in one and "hidden_size" in one), None)
     if text is None or config.get("type") in _CONTINUOUS:
         return Described(None, 0)
-    heads = int(text.get("num_attention_heads", 1))
+    width, heads = _size(text, "hidden_size"), _size(text, "num_attention_heads", 1)
     language = Language(
-        int(text["vocab_size"]),
-        int(text["hidden_size"]),
-        int(text.get("intermediate_size", 8 * text["hidden_size"] // 3)),
-        int(text.get("num_hidden_layers", 32)),
+        _size(text, "vocab_size"),
+        width,
+        _size(text, "intermediate_size", 8 * width // 3),
+        _size(text, "num_hidden_layers", 32),
         heads,
-        int(text.get("num_key_value_heads", heads)),
+        _size(text, "num_key_value_heads", heads),
     )
     vision, assumed, prompt = config.get("vision_config") or {}, [], _PATCHES + INSTRUCTION
     if {"hidden_size", "num_hidden_layers"} <= set(vision):
-        wide = int(vision["hidden_size"])
-        blocks, heads = int(vision["num_hidden_layers"]), int(vision.get("num_attention_heads", 1))
-        sides = int(vision.get("image_size", 224)), int(vision.get("patch_size", 14))
+        wide = _size(vision, "hidden_size")
+        blocks, heads = _size(vision, "num_hidden_layers"), _size(vision, "num_attention_heads", 1)
+        sides = _size(vision, "image_size", 224), _size(vision, "patch_size", 14)
         # one block more, because OpenVLA's towers do not use their last
-        tower = Tower(wide, blocks + 1, heads, int(vision.get("intermediate_size", 4 * wide)), 0, False, *sides)
+        tower = Tower(wide, blocks + 1, heads, _size(vision, "intermediate_size", 4 * wide), 0, False, *sides)
         encoder, prompt = encoder_of([tower], language.hidden_size), tower.patches + INSTRUCTION
     else:
         encoder = SHAPES["openvla-7b"].parts["encode"]
         assumed = [] if settings.vision else ["the vision encoder of OpenVLA-7B"]
     shape = vla_shape(file.parent.name, language, prompt, encoder)
     return Described(shape, 7, (*assumed, *_prompt(settings, prompt)))
+
+
+def _size(fields: Mapping[str, Any], key: str, default: int | None = None) -> int:
+    """Return a size of a `config.json`, or `default` if the file does not state it.
+
+    Raises:
+        TypeError: It is no number, or it is missing and has no default.
+        ValueError: It is below 1.
+    """
+    size = int(fields.get(key, default))
+    if size < 1:
+        raise ValueError(f"{key}={size}")
+    return size
 
 
 def _of_target(target: Mapping[str, Any], folder: Path) -> Described:

@@ -68,10 +68,12 @@ class EstimateSettings(CommandSettings):
             prefix: Start of the settings' names in error messages.
 
         Raises:
-            UsageError: A device is unknown, or there is nothing to choose from.
+            UsageError: A device is unknown, there is nothing to choose from, or the costs are named twice.
         """
         if self.choose != "none" and not self.trace:
             raise UsageError(f"{prefix}choose={self.choose} needs trace=FILE", f"{prefix}choose")
+        if self.on and (described := [key for key in ("weights", "model", "vision") if getattr(self, key)]):
+            raise UsageError(f"{prefix}on=PROFILE has the costs: leave out {', '.join(described)}", f"{prefix}on")
         for name in self.device:
             if name not in DEVICES:
                 raise UsageError(f"{prefix}device={name}: known are {', '.join(DEVICES)}", f"{prefix}device")

@@ -137,7 +137,8 @@ def read_trace(path: Path) -> list[TracedDecode]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise CheckpointError(f"trace={path} cannot be read: {error}") from error
+        why = getattr(error, "strerror", None) or error
+        raise CheckpointError(f"trace={path} cannot be read: {why}") from error
     decodes = []
     for number_, line in enumerate(lines, 1):
         if line.strip():
