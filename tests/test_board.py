@@ -76,6 +76,9 @@ def test_paths_outside_the_results_folder_are_refused(tmp_path):
                  "/static/%2e%2e/app.py", "/report/..%2freport.py", "/studies/..%2fsecret/tables"):  # fmt: skip
         answer = client.get(path)
         assert (answer.status_code, "treasure" in answer.text) == (404, False), path
+    (results / "kerv.db").write_text("damaged")
+    answer = client_of(results).get("/")
+    assert (answer.status_code, "<title>That did not work" in answer.text) == (500, True)
 
 
 def test_hostile_names_are_text(tmp_path):

@@ -179,5 +179,5 @@ def _database(settings: DoctorSettings) -> str:
     database = database_of(settings)
     rows = len(run_rows(database))
     what = "PostgreSQL" if database.file is None else "SQLite"
-    says = f"{rows} commands in it" if database.exists else "made by the first command that needs it"
+    says = f"{count(rows, 'command')} in it" if database.exists else "made by the first command that needs it"
     return f"{what}, {database.shown}: {says}"
