@@ -108,10 +108,11 @@ def test_a_report_prices_the_study_on_several_machines(results):
     profile_file(results, "elsewhere")
     document = json.loads((results / "bench/elsewhere.json").read_text())
     (results / "bench/elsewhere.json").write_text(json.dumps({**document, "device_name": "CPU"}))
-    assert "vla-150m, GPU: per episode" in report(results, "on=there,elsewhere")
+    assert "vla-150m, GPU: per episode" in report(results, "on=there,elsewhere", "loss=99")
     table = pd.read_csv(results / "report/tables/threshold_on.csv")
     assert sorted(set(table["on"])) == ["elsewhere", "there"]
     page = (results / "studies/threshold/report.html").read_text()
+    assert '<p class="answer">spec_vla r=9 loses less than 99 points' in page  # a label begins with a small letter
     assert "On other machines" in page
     assert "same tokens in the same control steps" in page
 

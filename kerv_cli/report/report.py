@@ -249,14 +249,16 @@ def study_parts(report: Report) -> dict[str, Any]:
     """Return the values that the template _study.html shows."""
     data, verdict = report.data, report.verdict
     study, rows = data.study, data.results
-    first, results = rows[0].provenance, str(study.database.results)
+    first, results, answer = rows[0].provenance, str(study.database.results), verdict.sentence
+    if not answer.startswith(tuple(row.label for row in rows)):  # a label stays as it is
+        answer = answer[:1].upper() + answer[1:]
     return {
         "name": study.name,
         "title": data.study.title or study.name,
         "note": data.study.note,
         "about": f"{about(rows)} · kerv {first['kerv_version']} at {first['git_commit'][:12]}",
         "question": question(rows, report.loss),
-        "verdict": verdict.sentence[:1].upper() + verdict.sentence[1:],
+        "verdict": answer,
         "is_shown": verdict.is_shown,
         "order": order_of(data.by_speed),
         "settles": report.command_to_settle,
