@@ -153,6 +153,8 @@ def test_a_wrong_frame_gets_one_line_and_the_next_one_an_answer(policy, frame, s
         assert "\n" not in str(refused.value)
         assert any(said in line for line in log)
         assert client.infer(seen(0))["actions"].shape == (4, 4)
+        client.connection.close()
+        until(lambda: any("disconnected; 2 answers, p50" in line for line in log))  # a refusal is none
 
 
 def test_whoever_leaves_in_mid_message_leaves_the_server_running(policy):

@@ -147,14 +147,14 @@ class PolicyServer:
                 connection.send(greeting)
             while True:
                 frame, began = connection.recv(timeout=self.protocol.idle_s), time.perf_counter()
-                answer: bytes | str | None
                 try:
                     answer = conversation.answer(frame)
                 except Exception as error:  # noqa: BLE001 - whatever a client sends, the server goes on
                     internal = f"internal error, {type(error).__name__}: {str(error)[:200]}"
                     line = " ".join((str(error) if isinstance(error, KervError) else internal).split())[:LONGEST]
                     self.log(f"{who} error: {line}")
-                    answer = conversation.fault(line)
+                    connection.send(conversation.fault(line))
+                    continue
                 if answer is not None:
                     connection.send(answer)
                     conversation.last_ms = 1000 * (time.perf_counter() - began)
