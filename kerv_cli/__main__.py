@@ -10,6 +10,9 @@ from types import FrameType
 
 def main() -> None:
     """Run the command `kerv`. SIGTERM, which schedulers and `timeout` send, has the same effect as Ctrl-C."""
+    # a stream is None if the shell has closed it (`>&-`)
+    nowhere = open(os.devnull, "w")  # noqa: SIM115 - it stays open
+    sys.stdout, sys.stderr = sys.stdout or nowhere, sys.stderr or nowhere
     # a signal that is ignored stays ignored: nohup, or a shell's job in the background
     ours = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is not signal.SIG_IGN]
     for number in ours:

@@ -270,6 +270,12 @@ def test_an_interrupted_command_says_so_in_one_line(number, late, results):
     ] == []
 
 
+def test_closed_output_is_no_error(policies):
+    words = [sys.executable, "-m", "kerv_cli", "runs", "list", f"results={policies}"]
+    run = subprocess.run(words, preexec_fn=lambda: os.close(1), stderr=subprocess.PIPE, text=True, check=False)
+    assert (run.returncode, run.stderr) == (0, "")
+
+
 def test_an_interrupt_that_a_library_made_another_error_of_is_an_interrupt(capsys, monkeypatch):
     monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)  # which an interrupt changes
 

@@ -185,6 +185,8 @@ def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None =
                 line = ", ".join(filter(None, (line, f"{total} to run", about(left.seconds, left.source))))
         elif isinstance(event, BlockStarted):
             title = event.block.title
+            if left is not None and left.workers > 1 and not ended and not on_terminal:
+                line = f"a worker begins {title}"
         elif isinstance(event, Preparing):
             preparing = f"preparing {event.setting.label}, {event.number} of {event.of}"
             if total:

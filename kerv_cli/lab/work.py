@@ -207,18 +207,17 @@ def work(queue: Queue, prepare: Prepare, on_event: OnEvent = lambda event: None)
         StorageError: The disk is full or not writable, or the database did not answer for two minutes.
         KervError: The blocks were planned by another version of kerv.
     """
-    load, is_waiting, ended = load_per_core(), False, None
+    load, has_waited, ended = load_per_core(), False, None
     code_hash()  # takes a second when it is called first, in which this worker should hold no block
     with queue.beating():
         while True:
             claim = patiently(queue.claim, ended)
             if claim is not None:
-                is_waiting = False
                 ended = claim if _Attempt(queue, claim, prepare, on_event, load).run() else None
                 continue
             ended, (left, _) = None, patiently(queue.left)
-            if left and not is_waiting:
-                is_waiting = True
+            if left and not has_waited:
+                has_waited = True
                 on_event(BlocksWait())
             while left:
                 time.sleep(POLL_SECONDS)
