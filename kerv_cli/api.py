@@ -26,8 +26,8 @@ from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import ROLLOUT
 from kerv_cli.lab.store import Study as StoredStudy
 from kerv_cli.lab.study import plan, run
+from kerv_cli.report.measures import Row, averaged, frame_of
 from kerv_cli.report.report import report as write_reports
-from kerv_cli.report.results import Row, averaged, frame_of
 from kerv_cli.report.tables import load_study as load_data
 from kerv_cli.report.viewing import save_recording
 from kerv_cli.serve.interface import Message

@@ -8,8 +8,9 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 
-from kerv_cli.report.results import MICRO, Measures, Result
+from kerv_cli.report.measures import MICRO, Measures, Result
 from kerv_cli.report.statistics import NO_ESTIMATE, Estimate, PairedCounts, paired_difference, pairs_to_settle, wilson
+from kerv_cli.report.tables import with_matched_speed
 from kerv_cli.report.verdict import (
     choices,
     order_of,
@@ -18,7 +19,6 @@ from kerv_cli.report.verdict import (
     sentence,
     short_sentence,
     verdict_of,
-    with_matched_speed,
 )
 
 T = TypeVar("T", Measures, Result)

@@ -51,7 +51,8 @@ from kerv_cli.lab.work import (
     work,
 )
 from kerv_cli.lab.workers import LocalWorkers, disturbances, gpus_in_turn
-from kerv_cli.report.tables import further_of, load_study
+from kerv_cli.report.report import further_of
+from kerv_cli.report.tables import load_study
 from kerv_cli.worlds import EnvironmentPart
 
 pytestmark = pytest.mark.usefixtures("quick_report")

@@ -19,8 +19,7 @@ from kerv_cli.episodes.episode import run_episode
 from kerv_cli.episodes.policy import ExpertDecoder, check
 from kerv_cli.episodes.rows import decodes_table, episode_row, read_decodes, table_blob
 from kerv_cli.episodes.settings import RolloutSettings
-from kerv_cli.report.measures import measure, paired
-from kerv_cli.report.results import MACRO, MICRO
+from kerv_cli.report.measures import MACRO, MICRO, measure, paired
 from kerv_cli.report.viewing import save_recording
 from kerv_cli.report.viewing.token_outcomes import summary
 from kerv_cli.worlds import EnvironmentPart

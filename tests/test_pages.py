@@ -8,7 +8,7 @@ from studies_synthetic import swept, threshold_study
 
 from kerv_cli.report.report import Report, render
 from kerv_cli.report.tables import load_study
-from kerv_cli.report.viewing.film import Film
+from kerv_cli.report.viewing.viewer import Film
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,8 @@ from kerv_cli.episodes.rows import decode_records
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import Study
 from kerv_cli.report.profiles import NamedProfile, open_profiles
-from kerv_cli.report.reprice import own_prices, prices_table, repriced, repriced_summary
+from kerv_cli.report.reprice import own_prices, prices_table, repriced
+from kerv_cli.report.summary import repriced_summary
 from kerv_cli.report.tables import load_study
 
 pytestmark = pytest.mark.usefixtures("quick_report")

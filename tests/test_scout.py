@@ -29,8 +29,7 @@ from kerv_cli.methods.early.drafter import ScoutDrafter, ScoutNetwork, ScoutProp
 from kerv_cli.methods.merged import MergedProposerSettings
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.methods.unverified import AlwaysSkip, StreakSkip, StreakSkipSettings
-from kerv_cli.report.betting import p_value, wealth
-from kerv_cli.report.certificate import folder_of
+from kerv_cli.report.certificate import folder_of, p_value, wealth
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.program import compile_parts
 from kerv_cli.targets.compact.target import CompactTarget

@@ -29,13 +29,21 @@ from kerv_cli.lab.database import opened
 from kerv_cli.lab.plan import Episode
 from kerv_cli.lab.store import Study
 from kerv_cli.lab.work import RunEpisode
-from kerv_cli.report.glossary import METHODS, UNVERIFIED, WORDS, explained
+from kerv_cli.report.measures import MACRO, MICRO, Result, averaged, columns_of, frame_of
 from kerv_cli.report.plots import acceptance_figure, curves_figure, png, study_figures, with_lines
-from kerv_cli.report.report import Report, Unpublishable, refusals, render, report
-from kerv_cli.report.results import MACRO, MICRO, Result, averaged, columns_of, frame_of
+from kerv_cli.report.report import CSV_COLUMNS, Report, Unpublishable, further_of, refusals, render, report
 from kerv_cli.report.statistics import PairedCounts, mean_of, paired_difference, speedup, wilson
-from kerv_cli.report.summary import SummaryTable, not_in_turn, of_runs, summary_frame
-from kerv_cli.report.tables import CSV_COLUMNS, StudyData, further_of, load_study
+from kerv_cli.report.summary import (
+    METHODS,
+    UNVERIFIED,
+    WORDS,
+    SummaryTable,
+    explained,
+    not_in_turn,
+    note_of,
+    summary_frame,
+)
+from kerv_cli.report.tables import StudyData, load_study
 from kerv_cli.report.tally import Tally
 
 PREFILL = Round("prefill", "none", 0, (), (1,), 0, 1, 0, ())
@@ -432,7 +440,7 @@ def test_the_interval_of_a_ratio_takes_the_run_as_a_cluster_from_three_runs_on(t
             connection.execute(sa.update(tables.EPISODES).where(tables.EPISODES.c.id.in_(newest)).values(seconds))
         data = load_study(store)
         row = row_of(data.table, averaging=MICRO, label="naive_sd")
-        said.append((row["runs"], of_runs(data.results)))
+        said.append((row["runs"], note_of(data.results)))
         before = row["episode_speedup"] if slower == 1 else before
     assert [runs for runs, _ in said] == [1, 1, 3]
     assert ["alone" in text for _, text in said] == [True, True, False]

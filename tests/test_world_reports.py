@@ -13,12 +13,12 @@ from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings, SweepSettings, TimingSettings
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.work import RunEpisode
+from kerv_cli.report.measures import averaged, columns_of
 from kerv_cli.report.plots import latency_figure, study_figures
-from kerv_cli.report.report import report
-from kerv_cli.report.results import averaged, columns_of
+from kerv_cli.report.report import report, summed_table
 from kerv_cli.report.statistics import PairedCounts
 from kerv_cli.report.summary import summary_frame
-from kerv_cli.report.tables import is_stressed, latency_table, load_study, summed_table
+from kerv_cli.report.tables import is_stressed, latency_table, load_study
 from kerv_cli.report.verdict import verdict_of
 from kerv_cli.worlds.settings import StressSettings
 

@@ -30,7 +30,7 @@ from kerv_cli.board.recorder import Recorder
 from kerv_cli.catalogue.episodes import FoundEpisode, find_episode, outcomes
 from kerv_cli.engine.record import PHASES, DecodeRecord
 from kerv_cli.lab.store import IMPORT
-from kerv_cli.report.viewing.film import Film, animation, film_of
+from kerv_cli.report.viewing.viewer import Film, animation, film_of
 from kerv_cli.report.viewing.token_outcomes import OUTCOMES, chunk_size, outcomes_of, token_names, tokens_hash
 from kerv_cli.report.viewing.viewer import viewer_command
 from kerv_cli.worlds import specs

@@ -16,8 +16,8 @@ from starlette.responses import HTMLResponse, Response
 from kerv_cli.catalogue.entries import few
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import pulse
-from kerv_cli.report.glossary import with_code
-from kerv_cli.report.results import is_number
+from kerv_cli.report.summary import with_code
+from kerv_cli.report.measures import is_number
 
 TEMPLATES = Environment(
     loader=ChoiceLoader([PackageLoader("kerv_cli.board"), PackageLoader("kerv_cli.report")]),

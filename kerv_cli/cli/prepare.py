@@ -64,7 +64,8 @@ def unsolved_by(settings: PrepareSettings) -> str:
     """Return a sentence if the certificate's test has shown that the policy does not solve its tasks. Otherwise ""."""
     from kerv_cli.methods.artifacts import Artifacts
     from kerv_cli.methods.certified.certificate import CertificateArtifact
-    from kerv_cli.report.verdict import SOLVED, unsolved
+    from kerv_cli.report.tables import SOLVED
+    from kerv_cli.report.verdict import unsolved
 
     artifact = CertificateArtifact()
     path = Artifacts(settings.results, settings.policy).path(artifact.kind)

@@ -49,7 +49,7 @@ def rollout(
             end_with_json({"settings": list(resolved.settings), "tasks": tasks, "episodes": total, "seconds": seconds})
         typer.echo(f"{names}: {count(len(tasks), 'task')}, {count(total, 'episode')}, {about(seconds)}")
         return
-    from kerv_cli.report.results import averaged, frame_of
+    from kerv_cli.report.measures import averaged, frame_of
     from kerv_cli.report.summary import SummaryTable, setting_tables
     from kerv_cli.report.tables import load_study
 

@@ -198,7 +198,7 @@ def compare_(settings: CommandSettings, names: list[str], as_json: AsJson = Fals
         kerv runs compare main last
     """
     from kerv_cli.report.compare import compare, pairs_to_compare
-    from kerv_cli.report.results import is_number
+    from kerv_cli.report.measures import is_number
 
     runs = _run_names(names, 2, 2, "two runs, ID or ID:SETTING")
     comparisons = list(starmap(compare, pairs_to_compare(database_of(settings), *runs)))

@@ -225,15 +225,14 @@ def print_study(data: StudyData, all_columns: bool = False, how: str = "", expla
         how: What to type to see all columns. Empty: `kerv report study=NAME --all`.
         explain: Say in a few words what each setting is.
     """
-    from kerv_cli.report.glossary import explanations
-    from kerv_cli.report.summary import SummaryTable, not_in_turn
+    from kerv_cli.report.summary import SummaryTable, explanations, not_in_turn
     from kerv_cli.report.tables import split_values
 
     study = data.study
     how = how or f"kerv report study={study.name}{results_word(study.database.words)} --all"
     console().print(SummaryTable(data.results, all_columns, how))
     if explain:
-        for name, text in explanations((one.label, one.settings["method"]) for one in data.study.settings).items():
+        for name, text in explanations(study.settings).items():
             typer.echo(f"{name}: {text}")
     codes = split_values(row.provenance["code"] for row in data.results)
     if len(codes) > 1:
@@ -250,7 +249,7 @@ def print_study(data: StudyData, all_columns: bool = False, how: str = "", expla
 
 def print_prices(priced: Sequence[Priced]) -> None:
     """Print the estimated speeds on other machines. Print nothing if `priced` is empty."""
-    from kerv_cli.report.reprice import ASSUMES, repriced_summary
+    from kerv_cli.report.summary import ASSUMES, repriced_summary
 
     if priced:
         summary = repriced_summary(priced)

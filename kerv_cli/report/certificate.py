@@ -3,19 +3,32 @@
 The certificate states how much success a setting loses at most against AR (docs/methods.md §4.6, ours). AR is the
 study's baseline. The other settings are the candidates. The seeds must be new: no other study ran the policy on them.
 A policy is tested once. Only `again=true` allows a further test, with a smaller error probability.
+
+The test bets against a mean: the predictable plug-in bets of Waudby-Smith and Ramdas (2024).
+The hypothesis: each value in [0, 1] has an expectation of at least `bound`, given the values before it. A bettor bets
+against the hypothesis. Each bet is made before its value is known. The bettor's wealth starts at 1. If the hypothesis
+is true, the bets do not win on average, and the probability that the wealth ever reaches 1/δ is at most δ (Ville's
+inequality). So a wealth of 1/δ rejects the hypothesis at level δ, and the wealth may be checked after each value.
+
+Values of different groups, such as tasks, must come in random order. Sorted values would reject the hypothesis only
+because of their order.
+
+For a certificate of success, each value comes from two episodes with the same seed, one by autoregressive decoding and
+one by the method. Let a be 1 if autoregressive decoding succeeds, else 0. Let b be 1 if the method succeeds, else 0.
+The value is (1 + a − b) / 2, so 0, ½ or 1. The bound is (1 + m) / 2, where m is the margin. The hypothesis is that the
+method's rate of success is lower by at least m.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
-import itertools
+import math
 from collections.abc import Iterable, Sequence
 from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import sqlalchemy as sa
 
 from kerv_cli.base.durations import count
@@ -32,7 +45,6 @@ from kerv_cli.lab.plan import Episode, seeds_text
 from kerv_cli.lab.store import Study
 from kerv_cli.methods.certified.certificate import Attempt, Candidate, Certificate, CertificateArtifact
 from kerv_cli.methods.compose import Method
-from kerv_cli.report.betting import p_value
 from kerv_cli.report.measures import paired
 from kerv_cli.report.tables import load_study
 from kerv_cli.targets.provenance import provenance
@@ -40,6 +52,7 @@ from kerv_cli.training.settings import CalibrateSuccessSettings
 from kerv_cli.worlds import resolve_tasks, spec_of
 
 POINTS = 100.0
+MOST = 0.75  # largest share of the wealth that a bet may lose
 SOLVED_BY_AR = 0.5
 """Smallest success rate of AR for which a certificate is issued."""
 
@@ -47,56 +60,45 @@ _VARIED = ("prefill_draft", "skip")
 """Kinds of parts in which the candidates may differ."""
 _CONDITIONS = ("task", "seed", "episodes", "world", "rollout.clock", "runtime.dtype", "policy.kind", "policy.target")
 """Settings that must be the same for all candidates and the baseline."""
-_OF_CANDIDATES = ("chunk", "policy", *(kind for kind in METHOD_KINDS if kind not in _VARIED))
+_SHARED = tuple(kind for kind in METHOD_KINDS if kind not in _VARIED)
+_OF_CANDIDATES = ("chunk", "policy", *_SHARED)
 """Settings that must be the same for all candidates. The baseline may differ."""
 
 
 def folder_of(resolved: ResolvedStudy) -> Path:
     """Check that a study can give a certificate. Return the folder to write the certificate into.
 
-    Raises:
-        UsageError: The study has only a baseline, or a certificate does not apply to the study. Or its seeds are
-            outside the range reserved for selection, or the folder belongs to a policy that kerv ships.
-    """
-    candidates = _candidates(resolved)
-    if not candidates:
-        raise UsageError(f"study '{resolved.study.name}' has only its baseline: add a setting to certify")
-    _check_conditions(resolved)
-    first = next(iter(candidates.values()))
-    tasks = resolve_tasks(first.task)
-    seeds = range(first.seed, first.seed + first.episodes)
-    spec_of(tasks[0]).seeds.check(seeds, "selection", f"seed={first.seed}")
-    return artifacts_of(first).new(CertificateArtifact.kind)
-
-
-def _check_conditions(resolved: ResolvedStudy) -> None:
-    """Refuse studies to which a certificate does not apply.
-
     Candidates may differ only in the settings `prefill_draft` and `skip`. The baseline must be AR. All settings must
     have the same tasks, seeds, policy, number format and world, without stress. The world must wait during decodes.
 
     Raises:
-        UsageError: A condition is not met.
+        UsageError: The study has only a baseline, or a condition is not met. Or its seeds are outside the range
+            reserved for selection, or the folder belongs to a policy that kerv ships.
     """
-    baseline, first = resolved.settings[resolved.study.baseline], next(iter(_candidates(resolved).values()))
+    candidates = _candidates(resolved)
+    if not candidates:
+        raise UsageError(f"study '{resolved.study.name}' has only its baseline: add a setting to certify")
+    baseline, first = resolved.settings[resolved.study.baseline], next(iter(candidates.values()))
     for label, other in resolved.settings.items():
-        keys = _CONDITIONS if other is baseline else (*_CONDITIONS, *_OF_CANDIDATES)
-        differing = [key for key in keys if attrgetter(key)(other) != attrgetter(key)(first)]
-        if differing:
+        for key in _CONDITIONS if other is baseline else (*_CONDITIONS, *_OF_CANDIDATES):
+            if attrgetter(key)(other) != attrgetter(key)(first):
+                raise UsageError(
+                    f"setting '{label}' differs in {key}=: a certificate is of settings that differ in "
+                    f"{'= and '.join(_VARIED)}= alone, and of AR under the same conditions"
+                )
+    for kind in (*_VARIED, "proposer"):
+        if (chosen := getattr(baseline, kind).kind) != "none":
             raise UsageError(
-                f"setting '{label}' differs in {differing[0]}=: a certificate is of settings that differ in "
-                f"{'= and '.join(_VARIED)}= alone, and of AR under the same conditions"
+                f"the baseline '{resolved.study.baseline}' has {kind}={chosen}: a certificate compares with AR, set "
+                f"{kind}=none there"
             )
-    drafting = [kind for kind in (*_VARIED, "proposer") if getattr(baseline, kind).kind != "none"]
-    if drafting:
-        raise UsageError(
-            f"the baseline '{resolved.study.baseline}' has {drafting[0]}={getattr(baseline, drafting[0]).kind}: a "
-            f"certificate compares with AR, set {drafting[0]}=none there"
-        )
     if first.world.stress.active:
         raise UsageError("world.stress: a certificate says nothing of a stressed world, leave it out")
     if first.rollout.clock != WAITS:
         raise UsageError(f"rollout.clock={first.rollout.clock}: a certificate is of a world that waits, leave it out")
+    seeds = range(first.seed, first.seed + first.episodes)
+    spec_of(resolve_tasks(first.task)[0]).seeds.check(seeds, "selection", f"seed={first.seed}")
+    return artifacts_of(first).new(CertificateArtifact.kind)
 
 
 def planned_certificate(
@@ -117,12 +119,12 @@ def planned_certificate(
     tested = _candidates(resolved)
     first = next(iter(tested.values()))
     artifacts, tasks = artifacts_of(first), resolve_tasks(first.task)
-    needs = [one.needs for one in map(Method.of, tested.values())]
-    hashes = artifacts.check(itertools.chain.from_iterable(needs))
-    candidates = []
+    needs, candidates = list[str](), []
     for label, one in tested.items():
+        needs += Method.of(one).needs
         skip, draft = dataclasses.asdict(one.skip), dataclasses.asdict(one.prefill_draft)
         candidates.append(Candidate(label, skip=skip, draft=draft))
+    hashes = artifacts.check(needs)
     certificate = Certificate(
         target=hashes.pop("target"),
         actions=artifacts.description.actions,
@@ -130,7 +132,7 @@ def planned_certificate(
         environment=spec_of(tasks[0]).name,
         tasks=list(tasks),
         drafts=hashes,
-        method={kind: dataclasses.asdict(getattr(first, kind)) for kind in METHOD_KINDS if kind not in _VARIED},
+        method={kind: dataclasses.asdict(getattr(first, kind)) for kind in _SHARED},
         world={"camera": dataclasses.asdict(first.world.camera), "horizon": first.world.horizon},
         dtype=first.runtime.dtype,
         margin=settings.margin,
@@ -205,12 +207,12 @@ def attempts_on(target: str, folders: Iterable[Path]) -> list[Attempt]:
 
 def _other_study(target: str, store: Study, episodes: Sequence[Episode]) -> str:
     """Return the name of another study in which the policy ran some of these episodes. Empty if there is none."""
-    wanted, seeds = set(map(attrgetter("task", "seed"), episodes)), [one.seed for one in episodes]
+    wanted, seeds = set(map(attrgetter("task", "seed"), episodes)), sorted(map(attrgetter("seed"), episodes))
     query = (
         sa.select(STUDIES.c.name, SETTINGS.c.identity, WANTED.c.task, WANTED.c.seed)
         .select_from(WANTED.join(SETTINGS).join(STUDIES))
         .where(STUDIES.c.name != store.name, WANTED.c.episode_id.is_not(None))
-        .where(WANTED.c.seed.between(min(seeds), max(seeds)))
+        .where(WANTED.c.seed.between(seeds[0], seeds[-1]))
     )
     with store.database.reading() as connection:
         for name, identity, task, seed in connection.execute(query):
@@ -233,42 +235,25 @@ def certify(certificate: Certificate, store: Study, wanted: Sequence[Episode], b
     """
     episodes = load_study(store, wanted).episodes
     episodes = episodes[episodes["repeat"] == 0]  # a repeat measures the same world again: it is no further pair
-    pairs = paired(episodes, dict.fromkeys([one.label for one in certificate.candidates], baseline))
+    pairs = paired(episodes, dict.fromkeys(map(attrgetter("label"), certificate.candidates), baseline))
     testing = bool(episodes.loc[episodes["label"] == baseline, "success"].mean() >= SOLVED_BY_AR)
     candidates: list[Candidate] = []
     chosen = None
     for planned in certificate.candidates:
-        own = pairs[pairs["label"] == planned.label]
-        candidates.append(_candidate(planned, own, certificate.margin, certificate.delta, testing))
-        testing = candidates[-1].p is not None and candidates[-1].p <= certificate.delta
+        of_planned = pairs[pairs["label"] == planned.label]
+        ar, own = of_planned["success_baseline"].to_numpy(float), of_planned["success_method"].to_numpy(float)
+        # (n,) values in a random order, independent of the tasks
+        seed = int.from_bytes(hashlib.sha256(str(len(ar)).encode()).digest()[:4], "big")
+        values = np.random.default_rng(seed).permutation((1 + ar - own) / 2)
+        p = p_value(values, (1 + certificate.margin / POINTS) / 2, certificate.delta) if testing else None
+        lost, won, solved = int((ar > own).sum()), int((ar < own).sum()), int(own.sum())
+        tested = dataclasses.replace(
+            planned, pairs=len(ar), ar=int(ar.sum()), successes=solved, lost=lost, won=won, p=p
+        )
+        candidates.append(tested)
+        testing = p is not None and p <= certificate.delta
         chosen = len(candidates) - 1 if testing else chosen
     return dataclasses.replace(certificate, candidates=candidates, chosen=chosen)
-
-
-def _candidate(planned: Candidate, pairs: pd.DataFrame, margin: float, delta: float, testing: bool) -> Candidate:
-    """Return a candidate with the results of its episodes and of its test against AR.
-
-    Args:
-        planned: The candidate without results.
-        pairs: Its episodes paired with AR's, from `paired`.
-        margin: Largest acceptable loss of success, in points.
-        delta: Level of the test.
-        testing: Whether to compute a p-value. False after an earlier setting has failed, or if AR solves too little.
-    """
-    ar, own = pairs["success_baseline"].to_numpy(float), pairs["success_method"].to_numpy(float)
-    # (n,) values in a random order, independent of the tasks
-    seed = int.from_bytes(hashlib.sha256(str(len(ar)).encode()).digest()[:4], "big")
-    values, bound = np.random.default_rng(seed).permutation((1 + ar - own) / 2), (1 + margin / POINTS) / 2
-    p = p_value(values, bound, delta) if testing else None
-    return dataclasses.replace(
-        planned,
-        pairs=len(pairs),
-        ar=int(ar.sum()),
-        successes=int(own.sum()),
-        lost=int((ar > own).sum()),
-        won=int((ar < own).sum()),
-        p=p,
-    )
 
 
 def write(folder: Path, certificate: Certificate) -> Path:
@@ -295,3 +280,50 @@ def _candidates(resolved: ResolvedStudy) -> dict[str, RolloutSettings]:
     settings = dict(resolved.settings)
     del settings[resolved.study.baseline]
     return settings
+
+
+def bets(values: np.ndarray, bound: float, delta: float) -> np.ndarray:
+    """Return the size of the bet on each value. A bet multiplies the wealth by 1 + size · (bound − value).
+
+    Each bet depends only on the values before it and on the number of values n. So n must be chosen before the test.
+
+    Args:
+        values: (n,) in [0, 1], in the order in which they came.
+        bound: The hypothesis is a mean of at least `bound`, in (0, 1).
+        delta: Error probability δ for which the bets are optimised.
+
+    Returns:
+        (n,) sizes of the bets.
+    """
+    count = np.arange(1, len(values) + 1)
+    mean = (0.5 + np.cumsum(values)) / (count + 1)
+    variance = (0.25 + np.cumsum((values - mean) ** 2)) / (count + 1)
+    before = np.concatenate([[0.25], variance])[:-1]
+    aim = 2 * math.log(1 / delta) / max(1, len(values))
+    return np.minimum(np.sqrt(aim / before), MOST / (1 - bound))
+
+
+def wealth(values: np.ndarray, bound: float, delta: float) -> np.ndarray:
+    """Return the bettor's wealth after each value, (n,). It starts at 1 and grows if the mean is below `bound`.
+
+    Args:
+        values: (n,) in [0, 1], in the order in which they came.
+        bound: The hypothesis is a mean of at least `bound`, in (0, 1).
+        delta: Error probability δ for which the bets are optimised. A test at another level δ′ may use the same wealth:
+            it rejects if the wealth reaches 1/δ′.
+    """
+    return np.exp(np.cumsum(np.log1p(bets(values, bound, delta) * (bound - values))))
+
+
+def p_value(values: np.ndarray, bound: float, delta: float) -> float:
+    """Return the p-value of the hypothesis that the mean is at least `bound`; 1 without values.
+
+    A bettor with an initial wealth of 1 bets against the hypothesis. The p-value is 1 divided by the largest wealth so
+    far. So it stays valid if it is checked after each value.
+
+    Args:
+        values: (n,) in [0, 1], in the order in which they came.
+        bound: The hypothesis is a mean of at least `bound`, in (0, 1).
+        delta: Error probability δ for which the bets are optimised.
+    """
+    return float(1 / max(1.0, wealth(values, bound, delta).max(initial=1.0)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import pandas as pd
 
@@ -13,8 +13,7 @@ from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, without
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.plan import seeds_text
 from kerv_cli.lab.store import Study
-from kerv_cli.report.measures import measure, paired
-from kerv_cli.report.results import Row, is_number
+from kerv_cli.report.measures import Row, is_number, measure, paired
 from kerv_cli.report.statistics import Estimate
 from kerv_cli.report.summary import DIFFERENCE, SPEEDS
 from kerv_cli.report.tables import StudyData, differences, flatten, load_study, split_values
@@ -29,7 +28,7 @@ _MEASURES = {
 _PROVENANCE = ("host", "device_name", "git_commit", "torch_version", "mujoco_version", "kerv_version")
 
 
-@dataclass(frozen=True)
+@dataclass
 class ComparedRun:
     """One side of a comparison: a training, or one setting of a run that has episodes.
 
@@ -102,10 +101,11 @@ def pairs_to_compare(database: Database, first: str, second: str) -> list[tuple[
     if len(pairs) < 2 and not (pairs and len(ours) == len(theirs) == 1):
         pairs = [(ours[0], side) for side in theirs if side != ours[0]]
     data: dict[str, StudyData] = {}
-    for run in (ours[0].run, theirs[0].run):
-        if run.has_episodes and run.id not in data:
-            data[run.id] = load_study(store_of(run, database))
-    return [(replace(a, data=data.get(a.run.id)), replace(b, data=data.get(b.run.id))) for a, b in pairs]
+    for side in itertools.chain.from_iterable(pairs):
+        if side.run.has_episodes and side.run.id not in data:
+            data[side.run.id] = load_study(store_of(side.run, database))
+        side.data = data.get(side.run.id)
+    return pairs
 
 
 def compare(first: ComparedRun, second: ComparedRun) -> Row:
@@ -122,8 +122,7 @@ def compare(first: ComparedRun, second: ComparedRun) -> Row:
     Raises:
         UsageError: A setting has no episodes.
     """
-    differing = differences(_settings_of(first), _settings_of(second))
-    settings = [dict(zip(("key", "first", "second"), values, strict=True)) for values in differing]
+    settings = differences(_settings_of(first), _settings_of(second))
     if first.data is None or second.data is None:
         ours, theirs = first.run.figures, second.run.figures
         results = [_change(name, ours[name], theirs[name]) for name in ours if name in theirs]
@@ -139,15 +138,21 @@ def _settings_of(side: ComparedRun) -> Row:
     if side.data is None:
         description = description_of(side.run)
         settings: Row = dict(description.get("settings", {}))
-        settings.update((key, description[key]) for key in ("git_commit", "versions", "demos") if key in description)
+        for key in ("git_commit", "versions", "demos"):
+            if key in description:
+                settings[key] = description[key]
         return flatten(settings)
     setting, episodes = side.data.settings[side.label], side.episodes
-    wanted = [one for one in side.data.study.episodes if one.setting.label == side.label]
+    tasks, seeds = set(), []
+    for one in side.data.study.episodes:
+        if one.setting.label == side.label:
+            tasks.add(one.task)
+            seeds.append(one.seed)
     settings = flatten(without(setting.settings, NOT_DETERMINING - {"policy", "method"}))
     for name, value in without(setting.identity, {OBSERVATION}).items():
         settings[name] = value[:12]
-    settings["tasks"] = ";".join(sorted(dict.fromkeys(one.task for one in wanted)))
-    settings["seeds"] = seeds_text([one.seed for one in wanted])
+    settings["tasks"] = ";".join(sorted(tasks))
+    settings["seeds"] = seeds_text(seeds)
     for name in _PROVENANCE:
         if name in episodes:
             settings[name] = ";".join(sorted(split_values(episodes[name].dropna())))

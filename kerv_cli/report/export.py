@@ -19,12 +19,11 @@ from kerv_cli.engine.record import PARALLEL
 from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.store import Study
-from kerv_cli.report.reprice import levels_of
-from kerv_cli.report.results import csv_text
+from kerv_cli.report.measures import csv_text
+from kerv_cli.report.reprice import READ, levels_of
 from kerv_cli.targets.settings import prompt_tokens
 
 FORMATS = ("csv", "parquet", "db", "trace")
-_TRACED = ("rounds", "similarity", *(f"seconds.{phase}" for phase in READ_PHASES))  # columns of a trace
 _AT_ONCE = 100  # episodes in memory at a time
 
 
@@ -47,34 +46,29 @@ def export(run: RunEntry, database: Database, to: str, folder: Path) -> list[Pat
     store = store_of(run, database)
     if to == "db":
         return [export_database(store, folder / run.id)]
+    episodes = store.frame()
+    if episodes.empty:
+        raise UsageError(f"study '{store.name}' has no episode yet: {store.how_to_run()}")
     if to == "parquet":
-        return _to_parquet(store, folder / run.id, run.labels)
+        return _to_parquet(store, episodes.assign(**run.labels), folder / run.id)
+    path = folder / (f"{run.id}.jsonl" if to == "trace" else f"{run.id}.csv")
     if to == "trace":
-        return [_to_trace(store, folder / f"{run.id}.jsonl")]
-    path = folder / f"{run.id}.csv"
-    episodes = _episodes(store).assign(**run.labels)
-    write_text(path, csv_text(episodes.drop(columns=["episode", "decode_seconds", "initial_state"])))
+        _to_trace(store, episodes, path)
+    else:
+        shown = episodes.assign(**run.labels).drop(columns=["episode", "decode_seconds", "initial_state"])
+        write_text(path, csv_text(shown))
     return [path]
 
 
-def _episodes(store: Study) -> pd.DataFrame:
-    """Return the table `Study.frame` of a study's episodes. Raise UsageError if the study has no episodes."""
-    frame = store.frame()
-    if frame.empty:
-        raise UsageError(f"study '{store.name}' has no episode yet: {store.how_to_run()}")
-    return frame
-
-
-def _to_parquet(store: Study, folder: Path, labels: Mapping[str, str]) -> list[Path]:
-    """Write all episodes of a study, with the run's labels, to episodes.parquet and all decodes to decodes.parquet."""
+def _to_parquet(store: Study, frame: pd.DataFrame, folder: Path) -> list[Path]:
+    """Write the episodes of a study to episodes.parquet and their decodes to decodes.parquet."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    frame, keys = _episodes(store), ["label", "task", "seed", "repeat"]
+    keys = ["label", "task", "seed", "repeat"]
     episodes, decodes = folder / "episodes.parquet", folder / "decodes.parquet"
     with atomic_path(episodes) as path:
-        labelled = frame.assign(**labels).drop(columns=["episode", "decode_seconds"])
-        table = pa.Table.from_pandas(labelled, preserve_index=False)
+        table = pa.Table.from_pandas(frame.drop(columns=["episode", "decode_seconds"]), preserve_index=False)
         pq.write_table(table, path, compression="zstd")
     schema = pa.schema([*map(table.schema.field, keys), *DECODE_SCHEMA])
     with atomic_path(decodes) as path, pq.ParquetWriter(path, schema, compression="zstd") as writer:
@@ -87,9 +81,9 @@ def _to_parquet(store: Study, folder: Path, labels: Mapping[str, str]) -> list[P
     return [episodes, decodes]
 
 
-def _to_trace(store: Study, path: Path) -> Path:
-    """Write every decode of a study as a line of a trace (docs/trace.md)."""
-    frame, settings = _episodes(store), {one.label: one.settings for one in store.load().settings}
+def _to_trace(store: Study, frame: pd.DataFrame, path: Path) -> None:
+    """Write every decode of a study's episodes as a line of a trace (docs/trace.md)."""
+    settings = {one.label: one.settings for one in store.load().settings}
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for label, part in frame.groupby("label", sort=False):
             chosen = settings.get(str(label), {})
@@ -98,10 +92,9 @@ def _to_trace(store: Study, path: Path) -> Path:
                 raise UsageError(f"--to trace: chunks of {label} differ in length, and a trace has one length")
             size = max((len(row["tokens"]) for row in _decodes(store, part, ["tokens"])), default=0)
             prompt, levels = prompt_tokens(target), levels_of(chosen)
-            for row in _decodes(store, part, _TRACED):
+            for row in _decodes(store, part, READ):
                 about = {"episode": row["episode"], "setting": label, "prompt": prompt, "tokens": size}
                 file.write(json.dumps({**about, **_line(row, levels)}) + "\n")
-    return path
 
 
 def _decodes(store: Study, episodes: pd.DataFrame, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
@@ -126,7 +119,7 @@ def _line(row: Mapping[str, Any], levels: int) -> dict[str, Any]:
     """Return a decode as one line of a trace, without the keys that all decodes of its episode share.
 
     Args:
-        row: Columns _TRACED of the decode.
+        row: Columns `READ` of the decode.
         levels: Levels of a drafted tree. Used for episodes of older versions of kerv, whose rounds have no levels.
     """
     seconds = {phase: row[f"seconds.{phase}"] for phase in READ_PHASES if row[f"seconds.{phase}"] is not None}

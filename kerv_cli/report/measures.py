@@ -1,11 +1,15 @@
-"""Compute the measures of docs/methods.md §7 from stored episodes (rows of the database's table `episodes`)."""
+"""Measure the episodes of a study's settings (docs/methods.md §7). Each result is a row of the study's table.
+
+CSV and JSON files, the terminal, the page, the board and the verdict all show these rows.
+"""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,8 +18,237 @@ import pandas as pd
 from kerv_cli.base.registry import ColumnPart
 from kerv_cli.engine.record import PHASES
 from kerv_cli.report import statistics as stats
-from kerv_cli.report.results import MACRO, MICRO, RATIO, Measures
-from kerv_cli.report.statistics import Estimate
+from kerv_cli.report.statistics import NO_ESTIMATE, Estimate, PairedCounts
+
+Row = dict[str, Any]
+"""One row of a table as it is written: column name to value."""
+
+MICRO = "micro over tasks"
+MACRO = "macro over difficulty groups"
+ONE_TASK = "one task"
+_GROUPS = {MICRO: ["label"], MACRO: ["label"], ONE_TASK: ["task", "label"]}
+"""Way of averaging -> columns that form the groups of episodes of which a row is measured."""
+RATIO = "ratio"
+"""Key of a measure's metadata: the columns of the episodes whose sums are its numerator and its denominator."""
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What was measured of a group of episodes. A measure without data is NaN.
+
+    Attributes:
+        successes: Number of solved worlds. Repeats measure the same world again and are not counted.
+        success: Success rate.
+        time_per_step_ms: Inference time per control step.
+        time_per_episode_ms: Inference time per episode.
+        phases: Time per control step in milliseconds, by phase of a decode. Keys begin with `ms.`.
+        steps_to_success: Mean number of control steps of the episodes that succeeded.
+        path_m: Mean length of the end effector's path in the episodes that succeeded, metres.
+        jerk: Mean of the episodes' root mean square jerk of the end effector, m/s³.
+        near_contact_failure: Share of the failures in which the hand came near the object.
+        latency_p50_ms: Median time of a decode.
+        latency_p95_ms: 95th percentile of the time of a decode.
+        latency_worst_ms: Time of the slowest decode.
+        AL: Acceptance length, tokens per verification.
+        accepted_per_round: Accepted draft tokens per verification.
+        AFEP: Mean position of a draft's first rejected token.
+        forwards_per_step: Target forwards per control step.
+        skip_rate: Share of decodes whose draft was executed without verification.
+        unverified_share: Share of executed tokens that the target did not verify.
+        compensation_rate: Share of decodes in which a prediction, not the target, filled in tokens.
+        retrieval_share: Share of decodes in which retrieval drafted.
+        deviation: Mean absolute difference between the executed actions and AR's, in normalised units.
+        felt_latency_ms: Mean time that the world went on during a decode.
+        felt_latency_steps: Mean number of control steps that the world went on during a decode.
+        held_share: Share of control steps that repeated the last action, because no newer one had arrived.
+        added: Values of the columns that plugins add, by name.
+        counts: Outcomes of the pairs with the baseline.
+        mcnemar_p: p-value of McNemar's exact test. NaN if there are no pairs.
+        difference: Success rate minus the baseline's.
+        margin: Loss of success below which a setting counts as non-inferior to the baseline.
+        non_inferior: Whether the loss of success is shown to be smaller than `margin`.
+        pairs_to_settle: Number of pairs that would show a loss below `margin`, see `statistics.pairs_to_settle`.
+        same_run: Whether the two episodes of every pair come from one run.
+        same_block: Share of pairs that were measured in one block (side by side in one process).
+        steps: Number of control steps.
+        decodes: Number of decodes.
+        deviation_samples: Number of decodes whose deviation was measured.
+        speedup: Speed per control step against the baseline, see `measures.speedups`.
+        episode_speedup: Speed per episode.
+        solved_speedup: Speed per episode, over the pairs that both solved.
+    """
+
+    successes: int
+    success: Estimate
+    time_per_step_ms: float
+    time_per_episode_ms: float
+    phases: Mapping[str, float]
+    steps_to_success: float
+    path_m: float
+    jerk: float
+    near_contact_failure: float
+    latency_p50_ms: float
+    latency_p95_ms: float
+    latency_worst_ms: float
+    AL: float = field(metadata={RATIO: ("committed", "verifications")})
+    accepted_per_round: float = field(metadata={RATIO: ("accepted", "verifications")})
+    AFEP: float = field(metadata={RATIO: ("first_rejected_sum", "first_rejected_count")})
+    forwards_per_step: float = field(metadata={RATIO: ("forwards", "steps")})
+    skip_rate: float = field(metadata={RATIO: ("skipped_decodes", "decodes")})
+    unverified_share: float = field(metadata={RATIO: ("unverified_tokens", "executed_tokens")})
+    compensation_rate: float = field(metadata={RATIO: ("compensated_decodes", "decodes")})
+    retrieval_share: float = field(metadata={RATIO: ("retrieval_decodes", "decodes")})
+    deviation: float = field(metadata={RATIO: ("deviation_sum", "deviation_count")})
+    felt_latency_ms: float = field(metadata={RATIO: ("delay_seconds", "delay_decodes")})
+    felt_latency_steps: float = field(metadata={RATIO: ("delay_steps", "delay_decodes")})
+    held_share: float = field(metadata={RATIO: ("held_steps", "steps")})
+    added: Mapping[str, float]
+    counts: PairedCounts
+    mcnemar_p: float
+    difference: Estimate
+    margin: float
+    non_inferior: bool
+    pairs_to_settle: float
+    same_run: bool
+    same_block: float
+    steps: int
+    decodes: int
+    deviation_samples: int
+    speedup: Estimate
+    episode_speedup: Estimate
+    solved_speedup: Estimate
+
+    @property
+    def pairs(self) -> int:
+        """Number of pairs with the baseline."""
+        return int(sum(self.counts))
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether all episodes were timed."""
+        return is_number(self.time_per_step_ms)
+
+
+@dataclass(frozen=True)
+class Result:
+    """One row of a study's table: a setting, over all tasks or on one task.
+
+    If episodes differ in the value of a text field, semicolons join the values.
+
+    Attributes:
+        study: Name of the study.
+        averaging: MICRO if all episodes are pooled, MACRO if difficulty groups are averaged, or ONE_TASK.
+        label: Label of the setting.
+        series: Name shared by all settings that differ only in the value on the study's axis.
+        unstressed: Label of the same setting without stress.
+        method: The setting's decoding method.
+        task: Names of the tasks.
+        tasks: Number of tasks.
+        difficulty: Difficulty groups of the tasks.
+        seeds: Seeds of the episodes, as `seeds_text` writes them.
+        repeats: How often every episode was measured.
+        episodes: Number of episodes.
+        baseline: Label of the setting that this one is compared with.
+        measures: Measured values.
+        runs: Number of runs (commands) from which the intervals of speed were computed.
+        overrides: Overrides of the setting, as typed.
+        settings: The setting, with dotted keys.
+        observation: What the target observes.
+        hashes: Hashes of weights and data, by column (`target_sha256`).
+        stress: Kind of stress, or `none`.
+        stress_level: Level of stress.
+        provenance: Machine, versions and the like, by column.
+        matched_success_speed: See `tables.with_matched_speed`.
+    """
+
+    study: str
+    averaging: str
+    label: str
+    series: str
+    unstressed: str
+    method: str
+    task: str
+    tasks: int
+    difficulty: str
+    seeds: str
+    repeats: int
+    episodes: int
+    baseline: str
+    measures: Measures
+    runs: int
+    overrides: str
+    settings: Mapping[str, Any]
+    observation: str
+    hashes: Mapping[str, str]
+    stress: str
+    stress_level: int
+    provenance: Mapping[str, str]
+    matched_success_speed: float = math.nan
+
+    @property
+    def where(self) -> str:
+        """The task if the row is of one task, else the way of averaging."""
+        return self.averaging if self.averaging in (MICRO, MACRO) else self.task
+
+    @property
+    def is_baseline(self) -> bool:
+        """Whether the row belongs to the baseline itself, which is not compared with anything."""
+        return self.label == self.baseline
+
+    @property
+    def is_compared(self) -> bool:
+        """Whether there are pairs to compare the setting with its baseline. Never so for the baseline itself."""
+        return not self.is_baseline and self.measures.pairs > 0
+
+    @property
+    def speed(self) -> float:
+        """Speed per episode against the baseline. 1 for the baseline itself, NaN if it was not measured."""
+        return 1.0 if self.is_baseline else self.measures.episode_speedup.value
+
+
+def columns_of(values: Mapping[str, Any]) -> Row:
+    """Return the fields of a row as the columns of a table.
+
+    An `Estimate` NAME becomes three columns: NAME, and NAME_low and NAME_high for the interval. `PairedCounts` become
+    the column `pairs` (number of pairs) and one column per outcome. A mapping becomes one column per key.
+
+    Args:
+        values: Fields by name, such as `vars(result)`.
+    """
+    columns: Row = {}
+    for name, value in values.items():
+        if isinstance(value, Estimate):
+            columns |= {name: value.value, f"{name}_low": value.low, f"{name}_high": value.high}
+        elif isinstance(value, PairedCounts):
+            columns |= {"pairs": sum(value), **value._asdict()}
+        elif isinstance(value, Measures):
+            columns |= columns_of(vars(value))
+        elif isinstance(value, Mapping):
+            columns |= value
+        else:
+            columns[name] = value
+    return columns
+
+
+def frame_of(results: Iterable[Result]) -> pd.DataFrame:
+    """Return rows as a data frame. A missing value is NaN."""
+    return pd.DataFrame(map(columns_of, map(vars, results)))
+
+
+def averaged(results: Iterable[Result], averaging: str = MICRO) -> list[Result]:
+    """Return the rows that pool all episodes (MICRO), or the rows that average over difficulty groups (MACRO)."""
+    return [row for row in results if row.averaging == averaging]
+
+
+def csv_text(table: pd.DataFrame) -> str:
+    """Return a data frame as CSV text with six significant digits. Missing values are empty cells."""
+    return table.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+
+
+def is_number(value: Any) -> bool:
+    """Return whether a value is a real number other than NaN. Text, bool and None are not."""
+    return isinstance(value, Real) and not isinstance(value, bool) and not math.isnan(value)
+
 
 NEAR = 0.02
 """Distance between hand and object, in metres, below which a failed episode counts as a near-contact failure."""
@@ -27,15 +260,14 @@ COMPARABLE = ("device", "device_name", "dtype", "threads")
 
 _RATIOS = {one.name: one.metadata[RATIO] for one in fields(Measures) if RATIO in one.metadata}
 """Measure -> (numerator, denominator), each a column summed over episodes. NaN if the denominator is 0."""
-_PHASES = [f"ms.{phase}" for phase in PHASES]
+_PHASES = {f"ms.{phase}": f"seconds.{phase}" for phase in PHASES}
 
 
 def measure(
     episodes: pd.DataFrame,
     pairs: pd.DataFrame,
-    by: Sequence[str] = ("label",),
     averaging: str = MICRO,
-    all_pairs: bool = False,
+    speeds: Mapping[Hashable, Speeds] | None = None,
 ) -> dict[Hashable, Measures]:
     """Return every measure of each group of episodes.
 
@@ -43,51 +275,54 @@ def measure(
         episodes: One row per episode. Columns: those of rows.EPISODE_SCHEMA, `label`, `decode_seconds`, `difficulty`,
             `run`, `block`, and those of `COMPARABLE`.
         pairs: Pairs of these episodes with the baseline's episodes, from `paired`.
-        by: Columns that form the groups: the label, or task and label.
         averaging: MACRO computes a measure for every difficulty group and returns the unweighted mean of the groups.
-            Any other value pools all episodes. Paired counts, McNemar's p and `pairs_to_settle` are always pooled.
-        all_pairs: Whether speedups also use pairs that were not measured in one block (side by side in one process).
+            MICRO and ONE_TASK pool the episodes of a setting. Paired counts, McNemar's p and `pairs_to_settle` are
+            always pooled.
+        speeds: Speedups by group. None: those of `pairs`, from `speedups`.
 
     Returns:
-        The measures by group.
+        The measures by group: by label, or with ONE_TASK by task and label.
     """
+    speeds = speedups(pairs, averaging) if speeds is None else speeds
     if averaging != MACRO:
         episodes, pairs = episodes.assign(difficulty=""), pairs.assign(difficulty="")
-    by, outcomes = list(by), list(stats.PairedCounts._fields)
+    by, outcomes, added = _GROUPS[averaging], list(PairedCounts._fields), list(ColumnPart.every())
     parts = [*by, "difficulty"]
     worlds = episodes["repeat"] == 0  # a repeat measures the same world again
     counted = episodes.assign(worlds=worlds, successes=worlds & episodes["success"].astype(bool))
     counts = counted.groupby(parts)[["successes", "worlds", "steps", "decodes", "deviation_count"]].sum()
     counts = counts.join(pairs.groupby(parts)[outcomes].sum()).fillna(0).astype(int)
     means = _means(episodes, parts).groupby(level=by).mean().join(pairs.groupby(by)[["same_run", "same_block"]].mean())
-    speeds = speedups(pairs, by, averaging, all_pairs)
+    phases: dict[Any, Any] = means[list(_PHASES)].to_dict("index")
+    of_plugins: dict[Any, Any] = means[added].to_dict("index")
     measured: dict[Hashable, Measures] = {}
-    found: dict[Any, Any] = means.to_dict("index")
+    found: dict[Any, Any] = means.drop(columns=[*_PHASES, *added]).to_dict("index")
     for group, others in found.items():
         part = counts.loc[group, :]  # a row per difficulty group
-        rates = list(itertools.starmap(stats.wilson, part[["successes", "worlds"]].to_numpy().tolist()))
-        pairings = itertools.starmap(stats.PairedCounts, part[outcomes].to_numpy().tolist())
-        changes = list(map(stats.paired_difference, pairings))
-        sums = part.sum().to_dict()
-        pooled = stats.PairedCounts(*map(sums.__getitem__, outcomes))
+        rates, changes = [], []
+        for successes, worlds, *outcome in part[["successes", "worlds", *outcomes]].to_numpy().tolist():
+            rates.append(stats.wilson(successes, worlds))
+            changes.append(stats.paired_difference(PairedCounts(*outcome)))
+        sums = part.sum()
+        pooled = PairedCounts(*sums[outcomes].tolist())
         measured[group] = Measures(
-            successes=sums["successes"],
+            successes=int(sums["successes"]),
             success=stats.mean_of(rates),
-            phases={name: others.pop(name) for name in _PHASES},
-            added={name: others.pop(name) for name in registered_columns()},
+            phases=phases[group],
+            added=of_plugins[group],
             same_run=others.pop("same_run") == 1,
             **others,
             **compared(pooled, stats.mean_of(changes)),
             pairs_to_settle=stats.pairs_to_settle(pooled, MARGIN),
-            steps=sums["steps"],
-            decodes=sums["decodes"],
-            deviation_samples=sums["deviation_count"],
+            steps=int(sums["steps"]),
+            decodes=int(sums["decodes"]),
+            deviation_samples=int(sums["deviation_count"]),
             **speeds.get(group, Speeds())._asdict(),
         )
     return measured
 
 
-def compared(counts: stats.PairedCounts, difference: Estimate) -> dict[str, Any]:
+def compared(counts: PairedCounts, difference: Estimate) -> dict[str, Any]:
     """Return the fields of `Measures` that compare a setting's success with the baseline's.
 
     Args:
@@ -139,12 +374,14 @@ def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame
         agree &= elsewhere | (both[f"{name}_method"] == both[f"{name}_baseline"])
     both = both[agree].sort_values(keys, kind="stable").reset_index(drop=True)
     won, reference = both["success_method"].astype(bool), both["success_baseline"].astype(bool)
-    outcomes = {"both": won & reference, "only_baseline": ~won & reference, "only_method": won & ~reference}
-    outcomes["neither"] = ~won & ~reference
+    counts = both["repeat"] == 0
     return both.assign(
         same_run=both["run_method"] == both["run_baseline"],
         same_block=both["block_method"] == both["block_baseline"],
-        **{name: (outcome & (both["repeat"] == 0)).astype(int) for name, outcome in outcomes.items()},
+        both=(counts & won & reference).astype(int),
+        only_baseline=(counts & ~won & reference).astype(int),
+        only_method=(counts & won & ~reference).astype(int),
+        neither=(counts & ~won & ~reference).astype(int),
     )
 
 
@@ -158,12 +395,27 @@ class Speeds(NamedTuple):
             the horizon, so a single one can decide the other two ratios.
     """
 
-    speedup: Estimate = stats.NO_ESTIMATE
-    episode_speedup: Estimate = stats.NO_ESTIMATE
-    solved_speedup: Estimate = stats.NO_ESTIMATE
+    speedup: Estimate = NO_ESTIMATE
+    episode_speedup: Estimate = NO_ESTIMATE
+    solved_speedup: Estimate = NO_ESTIMATE
 
 
-def speedups(pairs: pd.DataFrame, by: list[str], averaging: str, all_pairs: bool = False) -> dict[Hashable, Speeds]:
+def speedups_of_runs(runs: Sequence[pd.DataFrame], averaging: str, same_pairs: bool) -> dict[Hashable, Speeds]:
+    """Return the speedups of each group of pairs over several runs (docs/methods.md §7). A single run has its own.
+
+    Args:
+        runs: One table made by `paired` per run.
+        averaging: See `speedups`.
+        same_pairs: Whether all runs measured the same pairs.
+    """
+    combined, *others = [speedups(pairs, averaging) for pairs in runs]
+    for group, speeds in combined.items() if others else ():
+        several = zip(speeds, *[run.get(group, Speeds()) for run in others], strict=True)
+        combined[group] = Speeds(*[stats.over_runs(estimates, same_pairs) for estimates in several])
+    return combined
+
+
+def speedups(pairs: pd.DataFrame, averaging: str = MICRO, all_pairs: bool = False) -> dict[Hashable, Speeds]:
     """Return the speedups of each group of pairs.
 
     A group is left out if it has no usable pairs, if an episode was not timed, or if its setting runs no decoder (the
@@ -171,8 +423,8 @@ def speedups(pairs: pd.DataFrame, by: list[str], averaging: str, all_pairs: bool
 
     Args:
         pairs: Table made by `paired`.
-        by: Columns that form the groups.
-        averaging: MACRO: a mean time is the mean of the difficulty groups' means. Otherwise: the mean of all pairs.
+        averaging: ONE_TASK: a group is a task and a label; otherwise a label. MACRO: a mean time is the mean of the
+            difficulty groups' means; otherwise the mean of all pairs.
         all_pairs: Whether to use pairs that were not measured in one block (side by side in one process), too.
     """
     timed = pairs if all_pairs else pairs[pairs["same_block"]]
@@ -190,7 +442,7 @@ def speedups(pairs: pd.DataFrame, by: list[str], averaging: str, all_pairs: bool
 
     untimed = timed["seconds_baseline"].isna().to_numpy() | timed["seconds_method"].isna().to_numpy()
     found = {}
-    for group, members in timed.groupby(by).indices.items():
+    for group, members in timed.groupby(_GROUPS[averaging]).indices.items():
         index = np.asarray(members)
         if decodes[index].any() and not untimed[index].any():
             solved_by_both = index[solved[index]]
@@ -206,12 +458,13 @@ def _means(episodes: pd.DataFrame, by: list[str]) -> pd.DataFrame:
     each = {
         "time_per_step_ms": episodes["seconds"] * per_step,
         "time_per_episode_ms": 1000.0 * episodes["seconds"],
-        **{f"ms.{phase}": episodes[f"seconds.{phase}"] * per_step for phase in PHASES},
         "steps_to_success": episodes["steps"].where(solved),
         "path_m": episodes["path_length"].astype(float).where(solved),
         "jerk": episodes["jerk"].astype(float),
         "near_contact_failure": (distances < NEAR).astype(float).where(~solved & distances.notna()),
     }
+    for name, column in _PHASES.items():
+        each[name] = episodes[column] * per_step
     quantiles = {"latency_p50_ms": 0.5, "latency_p95_ms": 0.95, "latency_worst_ms": 1.0}
     latencies = []
     for _, arrays in groups["decode_seconds"]:
@@ -223,14 +476,6 @@ def _means(episodes: pd.DataFrame, by: list[str]) -> pd.DataFrame:
     for name, (above, below) in _RATIOS.items():
         means[name] = sums[above] / sums[below].mask(sums[below] == 0)
     means["felt_latency_ms"] *= 1000.0
-    for name, part in registered_columns().items():
+    for name, part in ColumnPart.every().items():  # of plugins
         means[name] = [float(part.built(group)) for _, group in groups]
     return means
-
-
-def registered_columns() -> Mapping[str, ColumnPart]:
-    """Return the table columns that plugins add, by name.
-
-    `ColumnPart.built` computes the column's value from the episodes of a setting.
-    """
-    return ColumnPart.every()

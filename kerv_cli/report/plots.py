@@ -7,6 +7,7 @@ to the setting that was clicked.
 
 from __future__ import annotations
 
+import functools
 import io
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -21,7 +22,7 @@ from PIL import Image
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import write_if_changed
-from kerv_cli.report.results import Result, averaged, frame_of, is_number
+from kerv_cli.report.measures import Result, averaged, frame_of, is_number
 from kerv_cli.report.summary import MAIN, summary_frame
 from kerv_cli.report.tables import NO_STRESS, is_stressed
 from kerv_cli.report.tally import Tally
@@ -67,19 +68,20 @@ def study_figures(results: Sequence[Result], axis: str, loss: float = 3.0) -> di
         return {"": lines_figure([_points(points, SUCCESS)], "level of stress", "success, %")}
     rows = with_lines(rows, axis)
     if rows["x"].notna().any():
-        measures = [_points(rows.assign(panel=TITLES[name]), name) for name in (SPEED, SUCCESS)]
-        return {"": lines_figure(filter(len, measures), axis)}
+        speed = _points(rows.assign(panel=TITLES[SPEED]), SPEED)
+        success = _points(rows.assign(panel=TITLES[SUCCESS]), SUCCESS)
+        return {"": lines_figure([speed, success] if len(speed) else [success], axis)}
     return {"_tradeoff": _tradeoff(rows, loss)} if rows["pairs"].any() else {}
 
 
 def about(results: Sequence[Result]) -> str:
     """Return the subtitle of a chart: policies, number of settings, tasks and episodes, device, number format."""
-    labels = list(dict.fromkeys(one.label for one in results))
-    targets = list(dict.fromkeys(str(row.settings["policy.target"]) for row in results))
-    tasks, episodes = max(one.tasks for one in results), max(one.episodes for one in results)
+    table = frame_of(results)
+    targets = table["policy.target"].astype(str).unique()
     names = ", ".join(targets) if len(targets) <= 2 else f"{len(targets)} policies"
-    counts = f"{count(len(labels), 'setting')} on {count(tasks, 'task')}, {count(episodes, 'episode')} each"
-    return f"{names} · {counts} · {results[0].provenance['device_name']}, {results[0].settings['runtime.dtype']}"
+    settings, tasks = count(table["label"].nunique(), "setting"), count(table["tasks"].max(), "task")
+    counts = f"{settings} on {tasks}, {count(table['episodes'].max(), 'episode')} each"
+    return f"{names} · {counts} · {table['device_name'][0]}, {table['runtime.dtype'][0]}"
 
 
 def _drawn(results: Sequence[Result]) -> pd.DataFrame:
@@ -106,11 +108,12 @@ def with_lines(rows: pd.DataFrame, axis: str) -> pd.DataFrame:
 def _points(rows: pd.DataFrame, column: str) -> pd.DataFrame:
     """Return the points of a chart that shows one column of the table. Success is in per cent."""
     scale = 1.0 if column == SPEED else 100.0
-    ends = {"value": "", "low": "_low", "high": "_high"}
-    values = {name: scale * rows[f"{column}{end}"].astype(float) for name, end in ends.items()}
     texts = rows.filter(regex="^text ").columns
-    fields = rows.reindex(columns=["setting", "line", "x", "panel", "is_baseline", *texts])
-    return fields.assign(**values).dropna(subset="value")
+    points = rows.reindex(columns=["setting", "line", "x", "panel", "is_baseline", *texts])
+    points["value"] = scale * rows[column].astype(float)
+    points["low"] = scale * rows[f"{column}_low"].astype(float)
+    points["high"] = scale * rows[f"{column}_high"].astype(float)
+    return points.dropna(subset="value")
 
 
 def _tooltip(points: pd.DataFrame) -> list[alt.Tooltip]:
@@ -239,10 +242,9 @@ def acceptance_figure(tallies: Mapping[str, Tally], references: Mapping[str, str
             points = pd.DataFrame({"x": first + np.arange(len(part)), "part": part, "whole": whole}).query("whole > 0")
             share = 100.0 * points["part"] / points["whole"]
             is_baseline = references.get(label) == label
-            texts = {"setting": label, "place": points["x"], "tokens": points["part"], "of": points["whole"]}
             fields: dict[str, Any] = {"setting": label, "line": label, "panel": panel, "is_baseline": is_baseline}
-            fields |= {"value": share, "low": share, "high": share}
-            fields |= {f"text {name}": text for name, text in texts.items()}
+            fields |= {"value": share, "low": share, "high": share, "text setting": label, "text place": points["x"]}
+            fields |= {"text tokens": points["part"], "text of": points["whole"]}
             frames.append(points[["x"]].assign(**fields))
     return lines_figure(frames, "position, DoF or number")
 
@@ -296,6 +298,7 @@ def png(figure: alt.ConcatChart, title: str, subtitle: str) -> bytes:
     return buffer.getvalue()
 
 
+@functools.cache
 def library() -> str:
     """Return the JavaScript that draws charts in a page (Vega-Embed with Vega and Vega-Lite). It needs no network."""
     return str(vl_convert.javascript_bundle())  # type: ignore[call-arg]  # its stub forgets that it has a default

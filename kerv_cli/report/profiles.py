@@ -100,17 +100,13 @@ def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfil
             paths += (folder / f"{name}.json", folder / f"{name}{_SHIPPED}")
         path = next(filter(Path.is_file, paths), None)
         if path is None:
-            raise UsageError(f"on={name}: no such profile. Make one with 'kerv bench target=TARGET'{_known(folders)}")
+            known: set[str] = set()
+            for folder in folders:
+                known.update(path.name.removesuffix(_SHIPPED) for path in folder.glob(f"*{_SHIPPED}"))
+            others = f", or take one of {', '.join(sorted(known))}" if known else ""
+            raise UsageError(f"on={name}: no such profile. Make one with 'kerv bench target=TARGET'{others}")
         try:
             profiles.append(NamedProfile(name, read_profile(path)))
         except CheckpointError as error:
             raise UsageError(f"on={name}: {error}") from error
     return profiles
-
-
-def _known(folders: Iterable[Path]) -> str:
-    """Return the clause of a message that names the profiles in some folders. Empty if the folders have none."""
-    names: set[str] = set()
-    for folder in folders:
-        names.update(path.name.removesuffix(_SHIPPED) for path in folder.glob(f"*{_SHIPPED}"))
-    return f", or take one of {', '.join(sorted(names))}" if names else ""

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import base64
 import functools
+import math
 import os
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,26 +25,36 @@ from kerv_cli.base.files import write_bytes, write_json, write_text
 from kerv_cli.episodes.identity import NOT_DETERMINING, without
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.store import ROLLOUT, SWEEP, Study, studies
-from kerv_cli.report.glossary import explanations, with_code
+from kerv_cli.report import statistics as stats
+from kerv_cli.report.measures import Result, Row, averaged, columns_of, compared, csv_text, frame_of
 from kerv_cli.report.plots import about, acceptance_figure, latency_figure, library, png, study_figures
 from kerv_cli.report.profiles import NamedProfile, open_profiles
-from kerv_cli.report.reprice import ASSUMES, Priced, own_prices, prices_table, repriced, repriced_summary
-from kerv_cli.report.results import MACRO, Result, csv_text, is_number
-from kerv_cli.report.summary import MAIN, MISSING, NOTE, SPEEDS, of_runs, summary_frame
-from kerv_cli.report.tables import (
-    CSV_COLUMNS,
-    StudyData,
-    differences,
-    flatten,
-    further_of,
-    is_stressed,
-    load_study,
-    split_values,
-    summed_table,
+from kerv_cli.report.reprice import Priced, own_prices, prices_table, repriced
+from kerv_cli.report.statistics import PairedCounts
+from kerv_cli.report.summary import (
+    ASSUMES,
+    MAIN,
+    explanations,
+    note_of,
+    repriced_summary,
+    suite_table,
+    task_table,
+    with_code,
 )
+from kerv_cli.report.tables import RUNTIME, StudyData, differences, flatten, is_stressed, load_study, split_values
 from kerv_cli.report.verdict import Verdict, caution, order_of, question, verdict_of
-from kerv_cli.report.viewing.film import animation, film_of
+from kerv_cli.report.viewing.viewer import animation, film_of
 
+CSV_COLUMNS = (
+    "study", "averaging", "label", "method", "stress", "stress_level", "task", "seeds", "episodes", "baseline",
+    "successes", "success", "success_low", "success_high", "runs", "speedup", "speedup_low", "speedup_high",
+    "episode_speedup", "episode_speedup_low", "episode_speedup_high", "solved_speedup", "solved_speedup_low",
+    "solved_speedup_high", "time_per_step_ms", "time_per_episode_ms", "latency_p95_ms", "AL", "forwards_per_step",
+    "skip_rate", "unverified_share", "compensation_rate", "retrieval_share", "pairs", "only_baseline", "only_method",
+    "mcnemar_p", "difference", "difference_low", "difference_high", "non_inferior", "pairs_to_settle",
+    "steps_to_success", "near_contact_failure", "matched_success_speed",
+)  # fmt: skip
+"""Columns of a study's CSV files. The remaining values are in tables/<study>.json (`further_of`)."""
 LOSS = 3.0
 """Default for the largest loss of success that the page's verdict accepts, in points."""
 _FRAMES = 240
@@ -176,9 +187,16 @@ def write_study(data: StudyData, loss: float, profiles: Sequence[NamedProfile] =
                 f"study {data.study.name} may not be published: {'; '.join(clauses)}. Commit, then run it on one "
                 f"machine: 'kerv sweep study={data.study.name} results=fresh'"
             )
+    tables = {"": data.table[list(CSV_COLUMNS)], "_per_task": data.per_task[list(CSV_COLUMNS)]}
+    if priced:
+        tables["_on"] = prices_table(priced)
+    if len(data.latencies):
+        tables["_latency"] = data.latencies
+    if is_stressed(data.results):
+        tables["_summed"] = summed_table(data.results)
     report, name = Report(data, loss, priced), data.name
     folder = data.study.database.results if publish else data.study.database.results / "report"
-    for suffix, table in tables_of(data, priced).items():
+    for suffix, table in tables.items():
         report.files.append(folder / "tables" / f"{name}{suffix}.csv")
         write_text(report.files[-1], csv_text(table))
     report.files.append(folder / "tables" / f"{name}.json")
@@ -192,21 +210,6 @@ def write_study(data: StudyData, loss: float, profiles: Sequence[NamedProfile] =
     return report
 
 
-def tables_of(data: StudyData, priced: Sequence[Priced]) -> dict[str, pd.DataFrame]:
-    """Return the tables of a study's CSV files.
-
-    Each key is the suffix of a file name: `_per_task` is the table for `<study>_per_task.csv`.
-    """
-    tables = {"": data.table[list(CSV_COLUMNS)], "_per_task": data.per_task[list(CSV_COLUMNS)]}
-    if priced:
-        tables["_on"] = prices_table(priced)
-    if len(data.latencies):
-        tables["_latency"] = data.latencies
-    if is_stressed(data.results):
-        tables["_summed"] = summed_table(data.results)
-    return tables
-
-
 class Unpublishable(KervError):
     """A study does not meet the conditions for publishing."""
 
@@ -217,22 +220,84 @@ def refusals(results: Sequence[Result]) -> list[str]:
     Args:
         results: The study's rows over all tasks.
     """
-    clauses = []
-    values = {}
-    for column in ("git_commit", "host", "device_name", "engine"):
-        values[column] = split_values(row.provenance[column] for row in results)
-    if any(commit.endswith("+changes") or commit in ("none", "") for commit in values["git_commit"]):
+    table, clauses = frame_of(results), []
+    if any(commit.endswith("+changes") or commit in ("none", "") for commit in split_values(table["git_commit"])):
         clauses.append("some episodes were computed by code that is not committed")
-    for found, what in zip(values.values(), ("commits", "machines", "devices", "engines"), strict=True):
-        if len(found) > 1:
-            clauses.append(f"its episodes are from {len(found)} {what}")
-    compared = [row for row in results if row.is_compared]
-    other_run = dict.fromkeys(row.label for row in compared if not row.measures.same_run)
-    not_in_turn = dict.fromkeys(row.label for row in compared if row.measures.same_block < 1)
-    for labels, what in ((other_run, "in one run with"), (not_in_turn, "in turn with")):
-        if labels:
+    origins = {"git_commit": "commits", "host": "machines", "device_name": "devices", "engine": "engines"}
+    for column, what in origins.items():
+        if (number := len(split_values(table[column]))) > 1:
+            clauses.append(f"its episodes are from {number} {what}")
+    table = table[(table["label"] != table["baseline"]) & (table["pairs"] > 0)]
+    for column, what in {"same_run": "in one run with", "same_block": "in turn with"}.items():
+        labels = table.loc[table[column] < 1, "label"].unique()
+        if len(labels):
             clauses.append(f"not measured {what} the baseline: {', '.join(labels)}")
     return clauses
+
+
+def further_of(data: StudyData) -> dict[str, Any]:
+    """Return the facts about a study that its CSV files leave out, as JSON values.
+
+    Returns:
+        A dictionary with the keys `study` (its name), `axis` (key of the plots' x axis) and `labels`. The last maps
+        each setting's label to a dictionary:
+
+        - `name`, `overrides` and `settings` of the setting
+        - `varies`: values of the keys that differ within its grid (the settings that one entry of the study expands to)
+        - `identity`: hashes of weights and data
+        - `provenance`: executor, machine, versions and the like
+        - `measures`: for each averaging and each task, the measures that have no column in the CSV files
+        - `acceptance`: how many draft tokens were accepted, over all tasks; only if drafts were verified
+    """
+    labels: dict[str, Any] = {}
+    for row in [*data.results, *data.task_results]:
+        setting = data.settings[row.label]
+        runtime = setting.settings["runtime"]
+        about = {
+            "name": setting.name,
+            "varies": dict(setting.varies),
+            "overrides": setting.overrides,
+            "settings": without(setting.settings, {"results", "task"}),
+            "identity": dict(setting.identity),
+            "provenance": {name: runtime[name] for name in RUNTIME} | dict(row.provenance),
+            "measures": {},
+        }
+        values: Row = {"tasks": row.tasks, "difficulty": row.difficulty, "repeats": row.repeats}
+        for name, value in columns_of(vars(row.measures)).items():
+            if name not in CSV_COLUMNS:
+                is_finite = not isinstance(value, float) or math.isfinite(value)
+                values[name] = value if is_finite else None  # JSON has no NaN
+        labels.setdefault(row.label, about)["measures"][row.where] = values
+    for label, tally in data.tallies.items():
+        labels[label]["acceptance"] = tally.as_dict()
+    return {"study": data.name, "axis": data.study.axis, "labels": labels}
+
+
+def summed_table(results: Iterable[Result]) -> pd.DataFrame:
+    """Pool a study's stressed episodes in three ways: by kind of stress, by level, and all together.
+
+    Each pooled row is compared with the baseline's episodes in the same worlds under the same stresses.
+
+    Returns:
+        One row for each method and each way of pooling. `method` is the setting's label without stress. `sum` says what
+        was pooled, such as `push`, `level 2` or `all`. `label` joins `method` and `sum`. The other columns are the same
+        as in a study's table.
+    """
+    rows = frame_of(averaged(results))
+    rows = rows[rows["stress_level"] > 0]
+    reference = "".join(rows.loc[rows["label"] == rows["baseline"], "unstressed"][:1])
+    counted = ["episodes", "successes", *PairedCounts._fields]
+    sums = []
+    for names in (rows["stress"], "level " + rows["stress_level"].astype(str), pd.Series("all", rows.index)):
+        for name, part in rows.groupby(names):
+            for method, pooled in part.groupby("unstressed", sort=False)[counted].sum().iterrows():
+                episodes, successes, *outcomes = pooled.tolist()
+                counts = PairedCounts(*outcomes)
+                about = {"study": rows["study"].iloc[0], "label": f"{method} {name}", "method": method, "sum": name}
+                success = {"episodes": episodes, "successes": successes, "success": stats.wilson(successes, episodes)}
+                change = compared(counts, stats.paired_difference(counts))
+                sums.append(columns_of({**about, "baseline": f"{reference} {name}", **success, **change}))
+    return pd.DataFrame(sums)
 
 
 def render(report: Report) -> str:
@@ -247,75 +312,40 @@ def render(report: Report) -> str:
 
 def study_parts(report: Report) -> dict[str, Any]:
     """Return the values that the template _study.html shows."""
-    data, verdict = report.data, report.verdict
+    data = report.data
     study, rows = data.study, data.results
-    first, results, answer = rows[0].provenance, str(study.database.results), verdict.sentence
+    first, results, answer = rows[0].provenance, str(study.database.results), report.verdict.sentence
     if not answer.startswith(tuple(row.label for row in rows)):  # a label stays as it is
         answer = answer[:1].upper() + answer[1:]
     return {
-        "name": study.name,
-        "title": data.study.title or study.name,
-        "note": data.study.note,
+        "of": study,
         "about": f"{about(rows)} · kerv {first['kerv_version']} at {first['git_commit'][:12]}",
         "question": question(rows, report.loss),
-        "verdict": answer,
-        "is_shown": verdict.is_shown,
+        "verdict": report.verdict,
+        "answer": answer,
         "order": order_of(data.by_speed),
         "settles": report.command_to_settle,
         "caution": caution(rows),
-        "wanted": len(data.study.episodes),
         "missing": len(data.absent),
         "absent": list(dict.fromkeys(f"{one.setting.label} on {one.task}" for one in data.absent)),
         "results": "" if results == "results" else f" results={shlex.quote(results)}",
-        "baseline": data.study.baseline,
         "main": MAIN,
-        "explained": explanations((row.label, row.method) for row in rows),
-        "columns": f"{NOTE} {of_runs(rows)}",
-        "suite": _suite(rows),
+        "explained": explanations(study.settings),
+        "columns": note_of(rows),
+        "suite": suite_table(rows),
         "charts": [figure.to_dict() for figure in report.figures.values()],
         "has_bounds": "_tradeoff" in report.figures,
         "has_acceptance": "_acceptance" in report.figures,
-        "tasks": _by_task(data.task_results),
+        "tasks": task_table(data.task_results),
         "episodes": "",  # the board gives the address of the page of episodes
         "machines": repriced_summary(report.priced) if report.priced else None,
         "assumes": ASSUMES,
         "settings": _settings(data),
         "films": [],
-        "recordings": [(path.stem, _href(path, study.root)) for path in study.recordings],
-        "files": [(path.name, _href(path, study.root)) for path in report.files if path.suffix == ".csv"],
+        "recordings": study.recordings,
+        "files": report.files,
+        "href": functools.partial(_href, study.root),
     }
-
-
-def _suite(results: Sequence[Result]) -> pd.DataFrame:
-    """Return the page's table of settings, pooled over tasks.
-
-    If the tasks have several difficulty groups, further columns have the unweighted mean of the groups.
-    """
-    frame = summary_frame(results)
-    if any(";" in row.difficulty for row in results):
-        macro = summary_frame(results, MACRO)
-        for name in ("success", *SPEEDS.values()):
-            frame[f"{name}, by difficulty"] = macro.get(name, MISSING)
-    return frame
-
-
-def _by_task(results: Sequence[Result]) -> pd.DataFrame:
-    """Return the page's table of successes and speeds per episode, by task and setting.
-
-    Tasks are rows and settings are columns, unless there are more settings than tasks.
-    """
-    cells: dict[str, dict[str, str]] = {}
-    for row in results:
-        cells.setdefault(row.label, {})[row.task] = _cell(row)
-    table = pd.DataFrame(cells).sort_index().fillna(MISSING).rename_axis("task")
-    return (table.T.rename_axis("setting") if len(table.columns) > len(table) else table).reset_index()
-
-
-def _cell(row: Result) -> str:
-    """Return successes / episodes and, if measured, the speed per episode, as text."""
-    share = f"{row.measures.successes}/{row.episodes // max(1, row.repeats)}"
-    speed = row.measures.episode_speedup.value
-    return share if row.is_baseline or not is_number(speed) else f"{share} · {speed:.2f}×"
 
 
 def _settings(data: StudyData) -> list[dict[str, Any]]:
@@ -356,6 +386,6 @@ def _films(data: StudyData) -> list[dict[str, Any]]:
     return list(films.values())
 
 
-def _href(path: Path, folder: Path) -> str:
+def _href(folder: Path, path: Path) -> str:
     """Return the address of a file relative to the page's folder."""
     return quote(Path(os.path.relpath(path, folder)).as_posix())

@@ -6,6 +6,7 @@ from a profile: a file of `kerv bench` with the seconds that each operation of a
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,17 +18,12 @@ import pyarrow.compute as pc
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.engine.cost import COUNTED, READ_PHASES, Profile, Work, prices, read_profile, work_of
-from kerv_cli.report.measures import measure, paired
-from kerv_cli.report.profiles import ENCODERS, NamedProfile, open_profiles
-from kerv_cli.report.results import Measures, Result, Row, averaged, columns_of
-from kerv_cli.report.summary import interval
+from kerv_cli.report.measures import MICRO, Measures, Result, Row, averaged, columns_of, measure, paired, speedups
+from kerv_cli.report.profiles import NamedProfile, open_profiles
 from kerv_cli.report.tables import StudyData
 
-ASSUMES = (
-    "Speed against the baseline by the cost model: the recorded decodes at a profile's costs, as if the other machine "
-    "and target decoded the same tokens in the same control steps; success is the recorded policy's"
-)
-_COLUMNS = ("index", "rounds", "similarity", *(f"seconds.{phase}" for phase in READ_PHASES))
+READ = ("index", "rounds", "similarity", *map("seconds.{}".format, READ_PHASES))
+"""Columns of a decode that the cost model reads."""
 
 
 @dataclass(frozen=True)
@@ -47,23 +43,21 @@ class Priced:
     measures: Measures
     encoders: Mapping[str, float]
 
-    @property
-    def columns(self) -> Row:
-        """The setting's row in `prices_table`."""
-        result, of, measured = self.result, self.measures, self.result.measures
-        machine = {"on": self.machine.name, "machine": self.machine.title, "projected": self.machine.is_projected}
-        speeds = {"episode_speedup": of.episode_speedup, "speedup": of.speedup}
-        times = {name: getattr(of, name) for name in ("time_per_episode_ms", "time_per_step_ms", "latency_p95_ms")}
-        before: Row = {"measured_episode_speedup": measured.episode_speedup, "measured_speedup": measured.speedup}
-        before["measured_on"] = result.provenance["device_name"]
-        about = {"study": result.study, "label": result.label, "baseline": result.baseline, **machine}
-        counts = {"episodes": result.episodes, "pairs": of.pairs}
-        return columns_of({**about, **speeds, **times, **self.encoders, **before, **counts})
-
 
 def prices_table(priced: Iterable[Priced]) -> pd.DataFrame:
     """Return the estimated speeds as a data frame: one row per machine and setting."""
-    return pd.DataFrame([one.columns for one in priced])
+    rows = []
+    for one in priced:
+        result, of, measured = one.result, one.measures, one.result.measures
+        row: Row = {"study": result.study, "label": result.label, "baseline": result.baseline, "on": one.machine.name}
+        row |= {"machine": one.machine.title, "projected": one.machine.is_projected}
+        row |= {"episode_speedup": of.episode_speedup, "speedup": of.speedup}
+        row |= {"time_per_episode_ms": of.time_per_episode_ms, "time_per_step_ms": of.time_per_step_ms}
+        row |= {"latency_p95_ms": of.latency_p95_ms, "encoders": one.encoders}
+        row |= {"measured_episode_speedup": measured.episode_speedup, "measured_speedup": measured.speedup}
+        row |= {"measured_on": result.provenance["device_name"], "episodes": result.episodes, "pairs": of.pairs}
+        rows.append(columns_of(row))
+    return pd.DataFrame(rows)
 
 
 def repriced(data: StudyData, profiles: Sequence[NamedProfile], lenient: bool = False) -> list[Priced]:
@@ -83,12 +77,12 @@ def repriced(data: StudyData, profiles: Sequence[NamedProfile], lenient: bool = 
     """
     if not profiles:
         return []
-    decoded = data.episodes.groupby("label")[["forwards", "skipped_decodes"]].sum().any(axis=1)
-    works = {label: _work_of_label(data, label) for label in data.labels if decoded[label]}
-    if not works:
-        return []
+    decoded, works = data.episodes.groupby("label")[["forwards", "skipped_decodes"]].sum().any(axis=1), {}
+    for label in data.labels:
+        if decoded[label]:
+            works[label] = _work_of_label(data, label)
     rows = []
-    for named in profiles:
+    for named in profiles if works else ():
         try:
             for label, work in works.items():
                 named.check(work.size, work.work.needs, label)
@@ -97,11 +91,12 @@ def repriced(data: StudyData, profiles: Sequence[NamedProfile], lenient: bool = 
                 continue
             raise
         estimated = _estimated(data, works, named.profile)
-        encoders = {name: _estimated(data, works, profile) for name, profile in named.encoders.items()}
-        for result in averaged(data.results):
-            if result.label in works:
-                speeds = {name: of[result.label].episode_speedup.value for name, of in encoders.items()}
-                rows.append(Priced(result, named, estimated[result.label], speeds))
+        encoders: dict[Hashable, dict[str, float]] = defaultdict(dict)
+        for name, profile in named.encoders.items():
+            for of, measures in _estimated(data, works, profile).items():
+                encoders[of][name] = measures.episode_speedup.value
+        found = [row for row in averaged(data.results) if row.label in works]
+        rows += [Priced(row, named, estimated[row.label], encoders[row.label]) for row in found]
     return rows
 
 
@@ -109,48 +104,35 @@ def _estimated(data: StudyData, works: Mapping[str, _LabelWork], profile: Profil
     """Return the measures of every setting, by its label, with the times of its decodes computed from a profile."""
     episodes = data.episodes
     priced = pd.concat([_priced(episodes[episodes["label"] == label], work, profile) for label, work in works.items()])
-    return measure(priced, paired(priced, data.references), all_pairs=True)
+    pairs = paired(priced, data.references)
+    return measure(priced, pairs, MICRO, speedups(pairs, all_pairs=True))
 
 
-def own_prices(data: StudyData) -> list[Priced]:
-    """Return the study's speeds, estimated for the machines that the study's file names.
+def own_prices(data: StudyData, elsewhere: bool = True) -> list[Priced]:
+    """Return the study's speeds, estimated for the machines that the study's file names and for its own machines.
 
-    If `kerv bench` has measured the machine that ran the study, the estimates for that machine follow.
-    """
-    return prices_on(data, dict.fromkeys((*data.study.machines, *own_profiles(data))))
-
-
-def prices_on(data: StudyData, names: Iterable[str]) -> list[Priced]:
-    """Return the estimates of `repriced` for several machines. Empty without usable profiles or times.
+    Estimates for a study's own machine need a profile of `kerv bench` that was measured there. Comparing them with the
+    measured times shows how accurate the cost model is. A profile that is missing or lacks a cost is left out.
 
     Args:
         data: The study's episodes.
-        names: Names of cost profiles. A profile that is missing or lacks a cost is left out.
+        elsewhere: Whether to estimate for the machines that the study's file names, too.
     """
-    profiles = []
-    for name in names:
+    results, profiles = data.study.database.results, dict[str, NamedProfile]()
+    for name in data.study.machines if elsewhere else ():
         with suppress(UsageError):
-            profiles += open_profiles(data.study.database.results, [name])
-    with suppress(UsageError):
-        return repriced(data, profiles, lenient=True)
-    return []
-
-
-def own_profiles(data: StudyData) -> list[str]:
-    """Return the names of the cost profiles of the study's targets that were measured on the study's own machines.
-
-    Comparing estimates from these profiles with the measured times shows how accurate the cost model is.
-    """
-    devices, names = set(data.episodes["device_name"]), []
-    for one in data.settings.values():
-        policy, runtime = one.settings.get("policy", {}), one.settings.get("runtime", {})
-        target = str(policy.get("target")).rstrip("/").rsplit("/", 1)[-1]
-        name = f"{target}-{runtime.get('dtype')}"
+            (profiles[name],) = open_profiles(results, [name])
+    devices = set(data.episodes["device_name"])
+    for one in data.study.settings:
+        target = str(one.settings["policy"]["target"]).rstrip("/").rsplit("/", 1)[-1]
+        name = f"{target}-{one.settings['runtime']['dtype']}"
         with suppress(CheckpointError):
-            profile = read_profile(data.study.database.results / "bench" / f"{name}.json")
+            profile = read_profile(results / "bench" / f"{name}.json")
             if profile.about.get("device_name") in devices:
-                names.append(name)
-    return names
+                profiles.setdefault(name, NamedProfile(name, profile))
+    with suppress(UsageError):
+        return repriced(data, list(profiles.values()), lenient=True)
+    return []
 
 
 class _LabelWork(NamedTuple):
@@ -179,7 +161,7 @@ def _work_of_label(data: StudyData, label: str) -> _LabelWork:
             f"setting '{label}' ran {batch} episodes at a time, without times: run it with rollout.batch=1"
         )
     episodes = data.episodes.loc[data.episodes["label"] == label, "episode"]
-    table = data.study.decodes(episodes.tolist(), _COLUMNS).combine_chunks()
+    table = data.study.decodes(episodes.tolist(), READ).combine_chunks()
     rounds = table["rounds"].combine_chunks()
     counts = pc.list_value_length(rounds).to_numpy(zero_copy_only=False).astype(np.int64)
     every = rounds.flatten()
@@ -217,24 +199,3 @@ def _priced(episodes: pd.DataFrame, work: _LabelWork, profile: Profile) -> pd.Da
     order = np.argsort(work.episode, kind="stable")
     stops = np.cumsum(np.bincount(work.episode, minlength=len(episodes)))[:-1]
     return episodes.assign(seconds=total, decode_seconds=pd.Series(np.split(seconds[order], stops), episodes.index))
-
-
-def repriced_summary(priced: Sequence[Priced]) -> pd.DataFrame:
-    """Return a table of speeds to print: one row per setting.
-
-    Two columns hold the measured speeds. Two more columns per machine hold the estimated speeds. If the machine's
-    profile was computed, a third column holds the speeds with other times of the vision encoder, see `ENCODERS`.
-    """
-    rows: dict[str, dict[str, str]] = {}
-    for row in priced:
-        machine, is_baseline = row.machine.title, row.result.is_baseline
-        cells = rows.setdefault(row.result.label, {"setting": row.result.label})
-        measured = f"measured, {row.result.provenance['device_name']}"
-        for source, of in ((measured, row.result.measures), (machine, row.measures)):
-            cells[f"{source}: per episode"] = "1×" if is_baseline else interval(of.episode_speedup, unit="×")
-            cells[f"{source}: per step"] = "1×" if is_baseline else interval(of.speedup, unit="×")
-        if row.encoders:
-            heading = f"{machine}: per episode, if the encoder takes {', '.join(ENCODERS.values())}"
-            texts = ["1"] * len(ENCODERS) if is_baseline else [f"{speed:.2f}" for speed in row.encoders.values()]
-            cells[heading] = f"{' / '.join(texts)}×"
-    return pd.DataFrame(rows.values())

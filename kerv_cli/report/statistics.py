@@ -80,10 +80,11 @@ def mean_of(groups: Sequence[Estimate]) -> Estimate:
     Returns:
         The mean of the known estimates with its interval. All three numbers are NaN if there are none.
     """
-    known = [group for group in groups if not math.isnan(group.value)]
-    if not known:
+    table = np.array(groups)
+    known = table[~np.isnan(table[:, 0])]
+    if not len(known):
         return NO_ESTIMATE
-    values, lows, highs = np.array(known).T
+    values, lows, highs = known.T
     mean = float(values.mean())
     below = math.sqrt(((lows - values) ** 2).sum()) / len(known)
     above = math.sqrt(((highs - values) ** 2).sum()) / len(known)
@@ -110,7 +111,7 @@ def paired_difference(counts: PairedCounts) -> Estimate:
     surplus = float(both * neither - only_method * only_baseline)
     if surplus > 0:
         surplus = max(surplus - pairs / 2, 0.0)  # correction for continuity
-    product = math.prod(pairs**2 * rate * (1 - rate) for rate in (method.value, baseline.value))
+    product = (pairs**2 * method.value * (1 - method.value)) * (pairs**2 * baseline.value * (1 - baseline.value))
     phi = surplus / math.sqrt(product) if product else 0.0
 
     def reach(a: float, b: float) -> float:
@@ -139,8 +140,8 @@ def difference(first: Estimate, second: Estimate) -> Estimate:
     return Estimate(value, low, value + math.hypot(second.high - second.value, first.value - first.low))
 
 
-def pairs_for_power(lost: float, won: float, power: float = 0.8) -> float:
-    """Return about how many pairs McNemar's exact test needs to show a difference at the 5 % level.
+def pairs_for_power(lost: float, won: float) -> float:
+    """Return about how many pairs McNemar's exact test needs to show a difference at the 5 % level, with 80 % power.
 
     A pair is one episode of the baseline and one of the method, from the same initial state. It is discordant if
     exactly one of the two succeeds. The number of discordant pairs is treated as random.
@@ -148,7 +149,6 @@ def pairs_for_power(lost: float, won: float, power: float = 0.8) -> float:
     Args:
         lost: Expected share of pairs in which only the baseline succeeds.
         won: Expected share of pairs in which only the method succeeds.
-        power: Probability with which the test shows the difference.
 
     Returns:
         The number of pairs. Infinite if it is above MOST_PAIRS.
@@ -165,7 +165,7 @@ def pairs_for_power(lost: float, won: float, power: float = 0.8) -> float:
     def reached(pairs: int) -> float:
         return float(np.diff(bdtr(discordant[: pairs + 1], pairs, lost + won), prepend=0.0) @ rejects[: pairs + 1])
 
-    found = bisect.bisect_left(range(MOST_PAIRS + 1), True, key=lambda pairs: reached(pairs) >= power)
+    found = bisect.bisect_left(range(MOST_PAIRS + 1), True, key=lambda pairs: reached(pairs) >= 0.8)
     return found if found <= MOST_PAIRS else math.inf
 
 
@@ -272,10 +272,11 @@ def over_runs(estimates: Sequence[Estimate], same_pairs: bool) -> Estimate:
     """
     from scipy.special import stdtrit
 
-    logs = np.log([one.value for one in estimates])
+    values, _, highs = np.array(estimates).T
+    logs = np.log(values)
     reach = float(stdtrit(len(logs) - 1, 0.975)) * float(logs.std(ddof=1)) / math.sqrt(len(logs))
     if same_pairs:
-        reach = math.hypot(reach, float(np.mean([math.log(one.high / one.value) for one in estimates])))
+        reach = math.hypot(reach, float(np.log(highs / values).mean()))
     value = math.exp(logs.mean())
     return Estimate(value, value / math.exp(reach), value * math.exp(reach))
 

@@ -1,12 +1,15 @@
-"""Turn a study's table into tables that people read, in the terminal and on the page."""
+"""Turn a study's table into tables that people read, in the terminal and on the page, and explain their names."""
 
 from __future__ import annotations
 
+import re
 import textwrap
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
+import markupsafe
 import pandas as pd
 from rich import box
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -16,8 +19,10 @@ from rich.text import Text
 
 from kerv_cli.base.durations import count
 from kerv_cli.engine.record import PHASES
-from kerv_cli.episodes.identity import stress_text
-from kerv_cli.report.results import MICRO, Result, averaged, is_number
+from kerv_cli.episodes.identity import Setting, stress_text
+from kerv_cli.report.measures import MACRO, MICRO, Result, averaged, frame_of, is_number
+from kerv_cli.report.profiles import ENCODERS
+from kerv_cli.report.reprice import Priced
 from kerv_cli.report.statistics import Estimate
 from kerv_cli.report.tables import StudyData
 
@@ -32,10 +37,46 @@ NOTE = (
     "In brackets: 95 % intervals. Change in success: points against the baseline, from the same initial states. Speed: "
     "times as fast as the baseline. Slowest 5 % of decodes: they take at least this many ms."
 )
+_TASK_COLUMNS = (
+    "task", "success", "steps per episode", "forwards per step", "tokens per verification", "drafts accepted",
+    "time per step, ms",
+)  # fmt: skip
 _HEADING = 12
 """Width at which a heading is wrapped, in characters."""
 _LABEL = 16
 """Width at which a label is wrapped, in characters."""
+METHODS = {
+    "ar": "token by token: one run of the policy for each token",
+    "early_unverified": "a small network writes every action, nobody verifies it",
+    "expert": "Meta-World's scripted expert, which is no policy",
+    "heisd": "similar demonstrations draft; very similar ones run unverified",
+    "jacobi": "guesses all tokens and corrects them in parallel, without a drafter",
+    "kerv": "Spec-VLA; after a rejection a Kalman filter predicts the rest",
+    "naive_sd": "a small network drafts, only equal tokens are accepted",
+    "one_pass": "a network drafts the action; one run verifies prompt and draft",
+    "parallel": "a policy that writes all tokens in one run",
+    "retrieval_unverified": "the most similar demonstration runs, nobody verifies it",
+    "scout_unverified": "a network with eyes of its own acts, nobody verifies it",
+    "sp_vla": "extrapolates fast motion, the policy decodes slow motion",
+    "spec_vla": "a small network drafts a tree of tokens, the policy verifies",
+}
+"""Family of methods -> what it does."""
+WORDS = {
+    "certified": "skips verification only as far as a test of success allows",
+    "chain": "drafts one chain of tokens in place of a tree",
+    "code": "as in the public code, where the paper says otherwise",
+    "literal": "the paper's formula, word for word",
+    "skip": "drafts that are similar enough run unverified",
+    "streak": "after drafts that agree, more of them run unverified",
+    "strict": "accepts only tokens that equal the policy's",
+    "tuned": "changed by us, to suit these policies",
+}
+"""Word in the name of a setting -> what it says."""
+UNVERIFIED = "executed tokens that the policy neither wrote nor accepted"
+ASSUMES = (
+    "Speed against the baseline by the cost model: the recorded decodes at a profile's costs, as if the other machine "
+    "and target decoded the same tokens in the same control steps; success is the recorded policy's"
+)
 
 
 def number(value: float) -> str:
@@ -141,8 +182,8 @@ class SummaryTable:
         """Yield the title, the table and the notes below it."""
         rows = averaged(self.results)
         first = rows[0]
-        tasks, episodes = max(one.tasks for one in rows), max(one.episodes for one in rows)
-        counts = f"{count(tasks, 'task')}, {count(episodes, 'episode')} per setting"
+        table = frame_of(rows)
+        counts = f"{count(table['tasks'].max(), 'task')}, {count(table['episodes'].max(), 'episode')} per setting"
         device = f"{first.provenance['device_name']}, {first.settings['runtime.dtype']}"
         yield Text(f"{first.study}: {counts}, {device}", "bold", overflow="fold")
         frame = summary_frame(rows)
@@ -152,18 +193,19 @@ class SummaryTable:
             yield _printed(part)
         if self.how and len(shown.columns) < len(frame.columns):
             yield Text(f"{len(shown.columns)} of {len(frame.columns)} columns; {self.how} shows all")
-        several = ", under the same stress and clock" if len({one.baseline for one in rows}) > 1 else ""
-        yield Text(f"{NOTE} {of_runs(rows)} Baseline: {first.baseline}{several}.")
+        several = ", under the same stress and clock" if table["baseline"].nunique() > 1 else ""
+        yield Text(f"{note_of(rows)} Baseline: {first.baseline}{several}.")
         if frame[SPEEDS["episode_speedup"]].str.endswith(APART).any():
             yield Text(f"{APART} only from pairs that were measured in turn")
-        if untimed := [row.label for row in rows if not row.measures.is_timed]:
+        untimed = table.loc[table["time_per_step_ms"].isna(), "label"]
+        if len(untimed):
             yield Text(f"not timed, for success alone: {', '.join(untimed)}")
 
 
-def of_runs(results: Sequence[Result]) -> str:
-    """Return one sentence that says from how many runs the intervals of speed were computed."""
-    runs = min(one.runs for one in results)
-    return f"Intervals of speed: of {runs} runs." if runs > 2 else "Intervals of speed: of this run alone."
+def note_of(results: Sequence[Result]) -> str:
+    """Return the note below a table. Its last sentence says from how many runs the intervals of speed were computed."""
+    runs = min(map(attrgetter("runs"), results))
+    return f"{NOTE} Intervals of speed: of {f'{runs} runs' if runs > 2 else 'this run alone'}."
 
 
 def _printed(frame: pd.DataFrame) -> Table:
@@ -219,34 +261,106 @@ def setting_tables(data: StudyData) -> Iterator[tuple[Any, Any, str]]:
         Column names, rows and title of each table.
     """
     episodes, setting = data.episodes, data.study.settings[0]
-    over_all = [replace(row, task="all") for row in averaged(data.results) if row.tasks > 1]
-    rows = list(map(_task_cells, [*data.task_results, *over_all]))
+    rows = []
+    for row in [*data.task_results, *averaged(data.results)]:
+        task = "all" if row.averaging == MICRO else row.task
+        success, accepted = f"{row.measures.successes}/{row.episodes}", number(row.measures.accepted_per_round)
+        cells = cells_of(row) | {"task": task, "success": success, "drafts accepted": accepted}
+        if task != "all" or row.tasks > 1:
+            rows.append(list(map(cells.__getitem__, _TASK_COLUMNS)))
     seeds = f"{episodes['seed'].min()}…{episodes['seed'].max()}"
     observation = setting.identity.get("observation", "")
     title = f"{setting.label}, observation {observation}{stress_text(setting.settings)}, seeds {seeds}"
     timed = episodes["seconds"].notna().all()
     if not timed:
         title += f"; not timed: {setting.batch} episodes at a time"
-    yield rows[0].keys(), list(map(dict.values, rows)), title
+    yield _TASK_COLUMNS, rows, title
     if timed:
         decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()
-        cells = []
+        shares = []
         for phase in PHASES:
             seconds = episodes[f"seconds.{phase}"].sum()
             if seconds:
-                cells.append((phase, f"{1000 * seconds / decodes:.2f}", f"{seconds / total:.0%}"))
-        yield ("phase", "ms per decode", "share"), cells, "time by phase"
+                shares.append((phase, f"{1000 * seconds / decodes:.2f}", f"{seconds / total:.0%}"))
+        yield ("phase", "ms per decode", "share"), shares, "time by phase"
 
 
-def _task_cells(row: Result) -> dict[str, str]:
-    """Return a row of the table of a single setting as text, by the column's heading."""
-    cells = cells_of(row)
-    return {
-        "task": row.task,
-        "success": f"{row.measures.successes}/{row.episodes}",
-        "steps per episode": cells["steps per episode"],
-        "forwards per step": cells["forwards per step"],
-        "tokens per verification": cells["tokens per verification"],
-        "drafts accepted": number(row.measures.accepted_per_round),
-        "time per step, ms": cells["time per step, ms"],
-    }
+def suite_table(results: Sequence[Result]) -> pd.DataFrame:
+    """Return the page's table of settings, pooled over tasks.
+
+    If the tasks have several difficulty groups, further columns have the unweighted mean of the groups.
+    """
+    frame = summary_frame(results)
+    if any(";" in row.difficulty for row in results):
+        macro = summary_frame(results, MACRO)
+        for name in ("success", *SPEEDS.values()):
+            frame[f"{name}, by difficulty"] = macro.get(name, MISSING)
+    return frame
+
+
+def task_table(results: Sequence[Result]) -> pd.DataFrame:
+    """Return the page's table of successes and speeds per episode, by task and setting.
+
+    Tasks are rows and settings are columns, unless there are more settings than tasks.
+    """
+    cells: dict[str, dict[str, str]] = {}
+    for row in results:
+        cell, speed = f"{row.measures.successes}/{row.episodes // row.repeats}", row.measures.episode_speedup.value
+        if not row.is_baseline and is_number(speed):
+            cell += f" · {speed:.2f}×"
+        cells.setdefault(row.label, {})[row.task] = cell
+    table = pd.DataFrame(cells).sort_index().fillna(MISSING).rename_axis("task")
+    return (table.T.rename_axis("setting") if len(table.columns) > len(table) else table).reset_index()
+
+
+def repriced_summary(priced: Sequence[Priced]) -> pd.DataFrame:
+    """Return a table of speeds to print: one row per setting.
+
+    Two columns hold the measured speeds. Two more columns per machine hold the estimated speeds. If the machine's
+    profile was computed, a third column holds the speeds with other times of the vision encoder, see `ENCODERS`.
+    """
+    rows: dict[str, dict[str, str]] = {}
+    for row in priced:
+        machine, is_baseline = row.machine.title, row.result.is_baseline
+        cells = rows.setdefault(row.result.label, {"setting": row.result.label})
+        measured = f"measured, {row.result.provenance['device_name']}"
+        for source, of in ((measured, row.result.measures), (machine, row.measures)):
+            cells[f"{source}: per episode"] = "1×" if is_baseline else interval(of.episode_speedup, unit="×")
+            cells[f"{source}: per step"] = "1×" if is_baseline else interval(of.speedup, unit="×")
+        if row.encoders:
+            heading = f"{machine}: per episode, if the encoder takes {', '.join(ENCODERS.values())}"
+            texts = ["1"] * len(ENCODERS) if is_baseline else map("{:.2f}".format, row.encoders.values())
+            cells[heading] = f"{' / '.join(texts)}×"
+    return pd.DataFrame(rows.values())
+
+
+def explained(label: str, method: str = "") -> str:
+    """Explain the label of a setting, word by word. Empty if none of its words is in the glossary.
+
+    Args:
+        label: The setting's label, such as `spec_vla chain`.
+        method: The setting's method, such as `spec_vla`. Empty: the label's first word.
+    """
+    method = method or re.split(r"[ ,]", label)[0]
+    family = max((name for name in METHODS if method == name or method.startswith(f"{name}_")), key=len, default="")
+    rest = f"{method.removeprefix(family)} {label.removeprefix(method)}" if family else f"{method} {label}"
+    words = [text for word, text in WORDS.items() if word in re.split(r"[\W_]+", rest)]
+    return "; ".join(filter(None, (METHODS.get(family, ""), *words)))
+
+
+def explanations(settings: Iterable[Setting]) -> dict[str, str]:
+    """Explain a table's settings, and its column *tokens unverified*.
+
+    Returns:
+        A dictionary from label or heading to explanation. Settings whose names have no known word are left out.
+    """
+    found = {}
+    for one in settings:
+        if text := explained(one.label, one.settings["method"]):
+            found[one.label] = text
+    return found | {"tokens unverified": UNVERIFIED}
+
+
+def with_code(text: str) -> markupsafe.Markup:
+    """Return a text as HTML. Words in backticks become <code> elements. Templates use this function as a filter."""
+    return markupsafe.Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(markupsafe.escape(text))))

@@ -1,4 +1,4 @@
-"""Build a study's tables from its stored episodes: over all tasks and per task, as data frames and CSV files."""
+"""Read a study's stored episodes, and compute its tables: over all tasks and per task."""
 
 from __future__ import annotations
 
@@ -7,46 +7,46 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
 
-import numpy as np
 import pandas as pd
-import pyarrow.compute as pc
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, Setting, flat, stress_of, without
 from kerv_cli.lab.plan import Episode, seeds_text
 from kerv_cli.lab.store import Study
-from kerv_cli.report import statistics as stats
-from kerv_cli.report.measures import Speeds, compared, measure, paired, speedups
-from kerv_cli.report.results import MACRO, MICRO, ONE_TASK, Result, Row, averaged, columns_of, frame_of, is_number
-from kerv_cli.report.statistics import PairedCounts
+from kerv_cli.report.measures import (
+    MACRO,
+    MARGIN,
+    MICRO,
+    ONE_TASK,
+    Result,
+    Row,
+    Speeds,
+    averaged,
+    frame_of,
+    is_number,
+    measure,
+    paired,
+    speedups_of_runs,
+)
+from kerv_cli.report.statistics import Estimate
 from kerv_cli.report.tally import Tally
-from kerv_cli.report.verdict import with_matched_speed
 from kerv_cli.targets.provenance import PACKAGES
 from kerv_cli.worlds import specs
 
-CSV_COLUMNS = (
-    "study", "averaging", "label", "method", "stress", "stress_level", "task", "seeds", "episodes", "baseline",
-    "successes", "success", "success_low", "success_high", "runs", "speedup", "speedup_low", "speedup_high",
-    "episode_speedup", "episode_speedup_low", "episode_speedup_high", "solved_speedup", "solved_speedup_low",
-    "solved_speedup_high", "time_per_step_ms", "time_per_episode_ms", "latency_p95_ms", "AL", "forwards_per_step",
-    "skip_rate", "unverified_share", "compensation_rate", "retrieval_share", "pairs", "only_baseline", "only_method",
-    "mcnemar_p", "difference", "difference_low", "difference_high", "non_inferior", "pairs_to_settle",
-    "steps_to_success", "near_contact_failure", "matched_success_speed",
-)  # fmt: skip
-"""Columns of a study's CSV files. The remaining values are in tables/<study>.json (`further_of`)."""
-
-_RUNTIME = ("device", "dtype", "threads")
+RUNTIME = ("device", "dtype", "threads")
 _PROVENANCE = (
-    "executor", "workers", "device_name", "host", *(f"{name}_version" for name in PACKAGES), "python_version",
+    "executor", "workers", "device_name", "host", *map("{}_version".format, PACKAGES), "python_version",
     "git_commit", "engine", "code", "run", "load",
 )  # fmt: skip
 
 
+SOLVED = 0.20
+"""Smallest success rate at which the baseline counts as solving its tasks."""
 NO_STRESS = "none"
 _AT_ONCE = 200  # episodes in memory at a time
 _ONE_STATE = ("code", "git_commit", "device_name")
@@ -78,7 +78,7 @@ class StudyData:
     @functools.cached_property
     def settings(self) -> dict[str, Setting]:
         """The settings by label."""
-        return {one.label: one for one in self.study.settings}
+        return dict(zip(self.study.labels, self.study.settings, strict=True))
 
     @functools.cached_property
     def labels(self) -> list[str]:
@@ -120,12 +120,10 @@ class StudyData:
         If the study does not run the setting without stress, the value is the label of the first setting that differs
         only in stress and `rollout.*`.
         """
-        first: dict[str, str] = {}
-        for setting in sorted(self.study.settings, key=_has_stress):
-            first.setdefault(_methods_of(setting), setting.label)
-        found = {}
-        for setting in self.study.settings:
-            found[setting.label] = first[_methods_of(setting)] if _has_stress(setting) else setting.label
+        first, found = dict[str, str](), {}
+        for setting in sorted(self.study.settings, key=lambda one: stress_of(one.settings)["level"] > 0):
+            same = first.setdefault(_methods_of(setting), setting.label)
+            found[setting.label] = same if stress_of(setting.settings)["level"] else setting.label
         return found
 
     @functools.cached_property
@@ -134,26 +132,35 @@ class StudyData:
         return paired(self.episodes, self.references)
 
     @functools.cached_property
-    def by_speed(self) -> list[tuple[str, stats.Estimate]]:
+    def pairs_of_runs(self) -> list[pd.DataFrame]:
+        """The table `pairs` of each run. `pairs` alone if the runs are not told apart."""
+        return [paired(run, self.references) for run in self.runs] or [self.pairs]
+
+    @functools.cached_property
+    def by_speed(self) -> list[tuple[str, Estimate]]:
         """The timed settings, the fastest per episode first, each with its speed per episode against the next slower.
 
         The slowest has NaN. Empty if the settings are compared with several baselines, or if fewer than two were timed.
         """
         timed = [row for row in averaged(self.results) if is_number(row.speed)]
-        order = [one.label for one in sorted(timed, key=attrgetter("speed"), reverse=True)]
-        if len(order) < 2 or len(set(self.references.values())) > 1:
+        if len(timed) < 2 or len(set(self.references.values())) > 1:
             return []
-        next_ones = dict(itertools.pairwise(order))
-        runs = [speedups(paired(run, next_ones), ["label"], MICRO) for run in self.runs or (self.episodes,)]
-        return [(label, _over_runs(runs, label, self.same_pairs).episode_speedup) for label in order]
+        labels = list(map(attrgetter("label"), sorted(timed, key=attrgetter("speed"), reverse=True)))
+        next_ones = dict(itertools.pairwise(labels))
+        runs = [paired(run, next_ones) for run in self.runs or (self.episodes,)]
+        speeds = speedups_of_runs(runs, MICRO, self.same_pairs)
+        return [(label, speeds.get(label, Speeds()).episode_speedup) for label in labels]
 
     @functools.cached_property
     def tallies(self) -> dict[str, Tally]:
         """How many draft tokens were accepted, for each setting that verified drafts. Reads all decodes."""
         episodes, tallies = self.episodes.groupby("label")["episode"], {}
         for label in self.labels:
-            tally = tally_of(self.study, episodes.get_group(label).tolist())
-            if tally is not None:
+            numbers, tally = episodes.get_group(label).tolist(), Tally.of_records((), 0)
+            for first in range(0, len(numbers), _AT_ONCE):
+                decodes = self.study.decodes(numbers[first : first + _AT_ONCE], ("rounds",))
+                tally += Tally.of_rounds(decodes["rounds"].combine_chunks().flatten())
+            if tally.drafts:
                 tallies[label] = tally
         return tallies
 
@@ -202,11 +209,6 @@ def references_of(settings: Sequence[Setting], baseline: str) -> dict[str, str]:
     return {one.label: same.get(_conditions_of(one), baseline) for one in settings}
 
 
-def _has_stress(setting: Setting) -> bool:
-    """Return whether a setting disturbs the world."""
-    return bool(stress_of(setting.settings)["level"])
-
-
 def _conditions_of(setting: Setting) -> str:
     """Return a setting's stress and its settings `rollout.*` as JSON, to find settings under the same conditions."""
     return json.dumps([stress_of(setting.settings), setting.settings["rollout"]], sort_keys=True)
@@ -232,7 +234,7 @@ def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyDa
     if wanted is None:
         study = study.load()
     else:
-        labels = {one.setting.label for one in wanted}
+        labels = set(map(attrgetter("setting.label"), wanted))
         settings = tuple(setting for setting in study.settings if setting.label in labels)
         study = replace(study, settings=settings, episodes=tuple(wanted))
     frame = study.frame(wanted)
@@ -241,14 +243,9 @@ def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyDa
     whole = study.whole_runs() if wanted is None else []
     same_pairs = len(whole) > 2
     frames = [study.frame(run=run) for run in whole] if same_pairs else _with_new_seeds(frame)
-    runs = [_labelled(study, run) for run in frames if _same_state(run, frame)]
+    state = frame.columns.intersection(list(_ONE_STATE))  # imported episodes may lack some columns
+    runs = [_labelled(study, run) for run in frames if all(set(run[name]) == set(frame[name]) for name in state)]
     return StudyData(study, _labelled(study, frame), tuple(runs) if len(runs) > 2 else (), same_pairs)
-
-
-def _same_state(run: pd.DataFrame, episodes: pd.DataFrame) -> bool:
-    """Return whether a run and the study's episodes were computed by the same code on the same machine."""
-    # imported episodes may lack some columns
-    return all(set(run[name]) == set(episodes[name]) for name in _ONE_STATE if name in episodes)
 
 
 def _with_new_seeds(episodes: pd.DataFrame) -> list[pd.DataFrame]:
@@ -256,50 +253,23 @@ def _with_new_seeds(episodes: pd.DataFrame) -> list[pd.DataFrame]:
 
     Otherwise return an empty list.
     """
-    runs = sorted((run for _, run in episodes.groupby("run")), key=lambda run: run["started"].min())
-    groups = episodes["label"].nunique() * episodes["task"].nunique()
-    seen: set[tuple[Any, ...]] = set()
-    for run in runs:
-        worlds = set(run[["task", "seed"]].itertuples(index=False, name=None))
-        if len(run[["label", "task"]].drop_duplicates()) < groups or worlds & seen:
-            return []
-        seen |= worlds
-    return runs
+    worlds = episodes[["run", "task", "seed"]].drop_duplicates()
+    cells = episodes[["run", "label", "task"]].drop_duplicates()
+    every = cells["label"].nunique() * cells["task"].nunique()
+    if worlds.duplicated(["task", "seed"]).any() or (cells.groupby("run").size() < every).any():
+        return []
+    return sorted((run for _, run in episodes.groupby("run")), key=lambda run: run["started"].min())
 
 
 def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
     """Add the columns difficulty, device, dtype and threads to the episodes."""
-    added = {"difficulty": episodes["task"].map(functools.cache(difficulty_of))}
-    for name in _RUNTIME:
-        values = {setting.label: setting.settings["runtime"][name] for setting in study.settings}
-        added[name] = episodes["label"].map(values)
-    added["initial_state"] = episodes["initial_state"].map(tuple)  # tuples can be compared
+    runtimes = pd.DataFrame([one.settings["runtime"] for one in study.settings], study.labels, list(RUNTIME))
+    difficulty = episodes["task"].map(functools.cache(difficulty_of))
+    states = episodes["initial_state"].map(tuple)  # tuples can be compared
+    labelled = episodes.assign(difficulty=difficulty, initial_state=states).join(runtimes, on="label")
     # strings as Python objects: these frames are cut into hundreds of small ones, and arrow's arrays are slow at that
     texts = ("label", "task", "block", "started", "device_name", "run", "difficulty", "device", "dtype")
-    return episodes.assign(**added).astype(dict.fromkeys(texts, object))
-
-
-def tally_of(study: Study, episodes: Sequence[int]) -> Tally | None:
-    """Count the verifications of some episodes of one setting. None if their decodes verified no draft.
-
-    Args:
-        study: The study.
-        episodes: Row numbers of the episodes.
-    """
-    total = None
-    for first in range(0, len(episodes), _AT_ONCE):
-        part = list(episodes[first : first + _AT_ONCE])
-        rounds = study.decodes(part, ("rounds",))["rounds"].combine_chunks().flatten()
-        is_verification = pc.and_(pc.greater(rounds.field("tree_size"), 0), pc.not_equal(rounds.field("mode"), "skip"))
-        rounds = rounds.filter(is_verification)
-        if not len(rounds):
-            continue
-        start, accepted, nodes = (rounds.field(name).to_numpy() for name in ("start", "accepted", "tree_size"))
-        judged = pc.list_value_length(rounds.field("drafted")).to_numpy().astype(np.int64)
-        dofs = len(rounds.field("threshold")[0])
-        tally = Tally.of(start, judged, accepted, nodes, dofs)
-        total = tally if total is None else total + tally
-    return total
+    return labelled.astype(dict.fromkeys(texts, object))
 
 
 def difficulty_of(task: str) -> str:
@@ -317,29 +287,21 @@ def _results(data: StudyData, averaging: str) -> list[Result]:
         data: The study.
         averaging: MICRO (pool all episodes), MACRO (average over difficulty groups) or ONE_TASK (a row for each task).
     """
-    by = ["task", "label"] if averaging == ONE_TASK else ["label"]
-    measured = measure(data.episodes, data.pairs, by, averaging)
-    runs = [speedups(paired(run, data.references), by, averaging) for run in data.runs]
-    indices = data.episodes.groupby(by).indices
-    texts = data.episodes.reindex(columns=["task", "difficulty", "seed", "repeat", *_PROVENANCE]).astype(object)
-    texts = texts.where(texts.notna(), None)
-
-    def key_of(group: Any) -> tuple[str, str]:
-        return group if averaging == ONE_TASK else ("", group)
-
-    def order(group: Any) -> tuple[str, int]:
-        task, label = key_of(group)
-        return task, data.labels.index(label)
-
+    speeds = speedups_of_runs(data.pairs_of_runs, averaging, data.same_pairs)
+    measured = measure(data.episodes, data.pairs, averaging, speeds)
+    texts = data.episodes.reindex(columns=["label", "task", "difficulty", "seed", "repeat", *_PROVENANCE])
+    texts = texts.astype(object).where(texts.notna(), None)
+    where = texts["task"] if averaging == ONE_TASK else pd.Series("", texts.index)
+    ordered = pd.Categorical(texts["label"], data.labels)
+    groups: Any = texts.groupby([where, ordered], observed=True)
     results = []
-    for group in sorted(indices, key=order):
-        part, (_, label) = texts.iloc[indices[group]], key_of(group)
-        measures = measured[group]
-        if runs:
-            measures = replace(measures, **_over_runs(runs, group, data.same_pairs)._asdict())
+    for (task, label), part in groups:
         setting = data.settings[label]
         stress = stress_of(setting.settings)
-        hashes = {f"{name}_sha256": value for name, value in sorted(setting.identity.items()) if name != OBSERVATION}
+        hashes = {}
+        for name, value in sorted(setting.identity.items()):
+            if name != OBSERVATION:
+                hashes[f"{name}_sha256"] = value
         row = Result(
             study=data.name,
             averaging=averaging,
@@ -347,40 +309,82 @@ def _results(data: StudyData, averaging: str) -> list[Result]:
             series=_series_of(setting, data.study.axis),
             unstressed=data.unstressed[label],
             method=setting.settings["method"],
-            task=_joined(sorted(part["task"].unique())),
+            task=_joined(sorted(set(part["task"]))),
             tasks=part["task"].nunique(),
-            difficulty=_joined(sorted(part["difficulty"].unique())),
+            difficulty=_joined(sorted(set(part["difficulty"]))),
             seeds=seeds_text(part["seed"].unique()),
             repeats=part["repeat"].nunique(),
             episodes=len(part),
             baseline=data.references[label],
-            measures=measures,
-            runs=max(1, len(runs)),
+            measures=measured[(task, label) if averaging == ONE_TASK else label],
+            runs=len(data.pairs_of_runs),
             overrides=setting.overrides,
             settings=flatten(without(setting.settings, NOT_DETERMINING - {"policy"})),
             observation=setting.identity.get(OBSERVATION, ""),
             hashes=hashes,
             stress=stress["kind"],
             stress_level=stress["level"],
-            provenance={name: _joined(part[name].unique()) for name in _PROVENANCE},
+            provenance={name: _joined(part[name]) for name in _PROVENANCE},
         )
         results.append(row)
     return results
 
 
-def _over_runs(runs: Sequence[Mapping[Hashable, Speeds]], group: Hashable, same_pairs: bool) -> Speeds:
-    """Return the speeds of a group over all runs (docs/methods.md §7).
+def with_matched_speed(rows: Sequence[Result]) -> list[Result]:
+    """Add the matched-success speed: one figure per method and baseline, in each of the method's rows.
+
+    How fast is a method at its fastest setting that keeps success (docs/methods.md §7)? The measure is from
+    WA-SpecDec, arXiv 2608.08725. It is the largest `episode_speedup` of the settings that pass the test with a margin
+    of 3 points. It is missing if no setting passes, or if the settings that pass were not timed. It is also missing for
+    the baseline itself, and if the baseline does not solve the tasks.
 
     Args:
-        runs: What `speedups` returned for each run.
-        group: Key of the group in those results.
-        same_pairs: Whether all runs measured the same pairs.
+        rows: One row per setting and task, or per setting and way of averaging.
     """
-    several = [run.get(group, Speeds()) for run in runs]
-    if len(several) == 1:
-        return several[0]
-    over_runs = functools.partial(stats.over_runs, same_pairs=same_pairs)
-    return Speeds(*map(over_runs, zip(*several, strict=True)))
+    solved, groups = set(), dict[tuple[str, str, str], list[Result]]()
+    for row in rows:
+        if row.is_baseline and row.measures.success.value >= SOLVED:
+            solved.add((row.where, row.label))
+        if row.is_compared:
+            groups.setdefault((row.where, row.baseline, row.method), []).append(row)
+    fastest: dict[tuple[str, str, str], float] = {}
+    for (where, baseline, method), group in groups.items():
+        if (where, baseline) in solved:
+            speeds = [one.speed for one in passing(sorted(group, key=safety), MARGIN) if one.speed > 0]
+            fastest[where, baseline, method] = max(speeds, default=math.nan)
+    matched = []
+    for row in rows:
+        speed = fastest.get((row.where, row.baseline, row.method), math.nan)
+        matched.append(row if row.is_baseline else replace(row, matched_success_speed=speed))
+    return matched
+
+
+def safety(row: Result) -> tuple[float, float]:
+    """Return the key that sorts settings from the safest on. It does not depend on success.
+
+    The setting with the smallest unverified share comes first: the share of executed actions that the target has not
+    verified, rounded to whole per cent. Settings that decode nothing come last. Of settings with equal shares, the one
+    with the most target forwards per control step comes first.
+    """
+    unverified = row.measures.unverified_share
+    return (1.0 if math.isnan(unverified) else round(unverified, 2), -row.measures.forwards_per_step)
+
+
+def passing(rows: Iterable[Result], loss: float) -> list[Result]:
+    """Test the settings in order. Return the rows before the first setting that is not shown to lose less than `loss`.
+
+    By fixed-sequence testing, all tests together have the error rate of one test.
+
+    Args:
+        rows: Rows of a table, in the order of the tests.
+        loss: Largest acceptable loss of success, as a share of episodes.
+    """
+    passed = []
+    for row in rows:
+        if not row.measures.difference.low > -loss:
+            break
+        passed.append(row)
+    return passed
 
 
 def _series_of(setting: Setting, axis: str) -> str:
@@ -404,13 +408,13 @@ def flatten(settings: Plain) -> Row:
     return values
 
 
-def differences(first: Row, second: Row) -> list[tuple[str, Any, Any]]:
-    """Return every key whose values differ, with both values. A value is None if that side does not have the key."""
+def differences(first: Row, second: Row) -> list[Row]:
+    """Return every `key` whose values differ, with both values: `first` and `second`. None: that side lacks the key."""
     found = []
     for key in first | second:
-        ours, theirs = first.get(key), second.get(key)
-        if ours != theirs:
-            found.append((key, ours, theirs))
+        pair = {"key": key, "first": first.get(key), "second": second.get(key)}
+        if pair["first"] != pair["second"]:
+            found.append(pair)
     return found
 
 
@@ -424,84 +428,9 @@ def split_values(texts: Iterable[object]) -> set[str]:
     return set(";".join(map(str, texts)).split(";"))
 
 
-def further_of(data: StudyData) -> dict[str, Any]:
-    """Return the facts about a study that its CSV files leave out, as JSON values.
-
-    Returns:
-        A dictionary with the keys `study` (its name), `axis` (key of the plots' x axis) and `labels`. The last maps
-        each setting's label to a dictionary:
-
-        - `name`, `overrides` and `settings` of the setting
-        - `varies`: values of the keys that differ within its grid (the settings that one entry of the study expands to)
-        - `identity`: hashes of weights and data
-        - `provenance`: executor, machine, versions and the like
-        - `measures`: for each averaging and each task, the measures that have no column in the CSV files
-        - `acceptance`: how many draft tokens were accepted, over all tasks; only if drafts were verified
-    """
-    labels: dict[str, Any] = {}
-    for row in [*data.results, *data.task_results]:
-        setting = data.settings[row.label]
-        about = {
-            "name": setting.name,
-            "varies": dict(setting.varies),
-            "overrides": setting.overrides,
-            "settings": without(setting.settings, {"results", "task"}),
-            "identity": dict(setting.identity),
-            "provenance": {name: setting.settings["runtime"][name] for name in _RUNTIME} | dict(row.provenance),
-            "measures": {},
-        }
-        labels.setdefault(row.label, about)["measures"][row.where] = _further_measures(row)
-    for label, tally in data.tallies.items():
-        labels[label]["acceptance"] = tally.as_dict()
-    return {"study": data.name, "axis": data.study.axis, "labels": labels}
-
-
-def _further_measures(row: Result) -> Row:
-    """Return the measures of a row that have no column in the CSV files. NaN, which JSON cannot hold, is None."""
-    values: Row = {"tasks": row.tasks, "difficulty": row.difficulty, "repeats": row.repeats}
-    for name, value in columns_of(vars(row.measures)).items():
-        if name not in CSV_COLUMNS:
-            values[name] = None if isinstance(value, float) and not math.isfinite(value) else value
-    return values
-
-
 def is_stressed(results: Iterable[Result]) -> bool:
     """Return whether a study compares several kinds or levels of stress (disturbed worlds, docs/stress.md)."""
     return len(set(map(attrgetter("stress", "stress_level"), results))) > 1
-
-
-def summed_table(results: Iterable[Result]) -> pd.DataFrame:
-    """Pool a study's stressed episodes in three ways: by kind of stress, by level, and all together.
-
-    Each pooled row is compared with the baseline's episodes in the same worlds under the same stresses.
-
-    Returns:
-        One row for each method and each way of pooling. `method` is the setting's label without stress. `sum` says what
-        was pooled, such as `push`, `level 2` or `all`. `label` joins `method` and `sum`. The other columns are the same
-        as in a study's table.
-    """
-    rows = [row for row in averaged(results) if row.stress != NO_STRESS]
-    reference = next((row.unstressed for row in rows if row.is_baseline), "")
-    kinds = dict.fromkeys(one.stress for one in rows)
-    levels = dict.fromkeys(f"level {one.stress_level}" for one in rows)
-    sums = []
-    for name in (*sorted(kinds), *sorted(levels), "all"):
-        methods: dict[str, list[Result]] = {}
-        for row in rows:
-            if name in (row.stress, f"level {row.stress_level}", "all"):
-                methods.setdefault(row.unstressed, []).append(row)
-        for method, pooled in methods.items():
-            about = {"study": rows[0].study, "label": f"{method} {name}", "method": method, "sum": name}
-            sums.append(columns_of({**about, "baseline": f"{reference} {name}", **_pooled(pooled)}))
-    return pd.DataFrame(sums)
-
-
-def _pooled(rows: Sequence[Result]) -> dict[str, Any]:
-    """Return the success of several settings together, and how it compares with their baselines."""
-    episodes, successes = sum(one.episodes for one in rows), sum(one.measures.successes for one in rows)
-    counts = PairedCounts(*np.sum([one.measures.counts for one in rows], axis=0).tolist())
-    success = {"episodes": episodes, "successes": successes, "success": stats.wilson(successes, episodes)}
-    return success | compared(counts, stats.paired_difference(counts))
 
 
 _LATENCY_COLUMNS = (
@@ -519,11 +448,9 @@ def latency_table(results: Iterable[Result]) -> pd.DataFrame:
     A row is left out if the world of its baseline waits during decodes. The added column `ar_latency_ms` is the mean
     latency of the baseline's decodes.
     """
-    rows = averaged(results)
-    latencies = {row.label: row.measures.felt_latency_ms for row in rows}
-    delayed = []
-    for row in rows:
-        of_baseline = latencies.get(row.baseline)
-        if is_number(row.measures.felt_latency_ms) and is_number(of_baseline):
-            delayed.append({**columns_of(vars(row)), "ar": row.baseline, "ar_latency_ms": of_baseline})
-    return pd.DataFrame(delayed, columns=list(_LATENCY_COLUMNS))
+    rows = frame_of(averaged(results))
+    of_baseline = rows["baseline"].map(rows.set_index("label")["felt_latency_ms"])
+    delayed = rows.assign(ar=rows["baseline"], ar_latency_ms=of_baseline).dropna(
+        subset=["felt_latency_ms", "ar_latency_ms"]
+    )
+    return delayed.reindex(columns=list(_LATENCY_COLUMNS))

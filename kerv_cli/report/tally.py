@@ -5,15 +5,17 @@ A token is *reached* if the target accepted all tokens before it in its draft.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from kerv_cli.engine.record import DecodeRecord
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 
 @dataclass(frozen=True)
@@ -54,11 +56,24 @@ class Tally:
     @classmethod
     def of_records(cls, decodes: Iterable[DecodeRecord], dofs: int) -> Tally:
         """Count the verifications of some decodes. `dofs` is the number of DoFs of an action."""
-        rounds = itertools.chain.from_iterable(map(attrgetter("rounds"), decodes))
-        verified = filter(attrgetter("is_verification"), rounds)
-        numbers = [(one.start, len(one.drafted), one.accepted, one.tree_size) for one in verified]
+        numbers: list[tuple[int, int, int, int]] = []
+        for decode in decodes:
+            verified = filter(attrgetter("is_verification"), decode.rounds)
+            numbers += [(one.start, len(one.drafted), one.accepted, one.tree_size) for one in verified]
         start, judged, accepted, nodes = np.array(numbers, int).reshape(-1, 4).T
         return cls.of(start, judged, accepted, nodes, dofs)
+
+    @classmethod
+    def of_rounds(cls, rounds: pa.StructArray) -> Tally:
+        """Count the verifications among some rounds of one setting, as they are stored (rows.DECODE_SCHEMA)."""
+        import pyarrow.compute as pc
+
+        is_verification = pc.and_(pc.greater(rounds.field("tree_size"), 0), pc.not_equal(rounds.field("mode"), "skip"))
+        rounds = rounds.filter(is_verification)
+        start, accepted, nodes = rounds.field("start"), rounds.field("accepted"), rounds.field("tree_size")
+        judged = pc.list_value_length(rounds.field("drafted")).to_numpy().astype(np.int64)
+        dofs = len(rounds.field("threshold")[0]) if len(rounds) else 0
+        return cls.of(start.to_numpy(), judged, accepted.to_numpy(), nodes.to_numpy(), dofs)
 
     def __add__(self, other: Tally) -> Tally:
         names = ("lengths", "judged", "reached", "accepted")
@@ -72,7 +87,7 @@ class Tally:
     @property
     def by_position(self) -> tuple[np.ndarray, np.ndarray]:
         """Two arrays: the number of reached and of accepted tokens at each position in the draft, in order."""
-        reached, accepted = (counts[::-1].cumsum()[::-1][1:] for counts in (self.judged, self.lengths))
+        reached, accepted = self.judged[::-1].cumsum()[::-1][1:], self.lengths[::-1].cumsum()[::-1][1:]
         return reached, _sum(np.zeros(len(reached), int), accepted)
 
     def as_dict(self) -> dict[str, Any]:

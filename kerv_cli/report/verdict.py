@@ -19,11 +19,9 @@ from typing import NamedTuple
 
 from kerv_cli.base.durations import count
 from kerv_cli.report import statistics as stats
-from kerv_cli.report.measures import MARGIN
-from kerv_cli.report.results import Result, Row, averaged, columns_of, is_number
+from kerv_cli.report.measures import Result, Row, averaged, columns_of, is_number
+from kerv_cli.report.tables import SOLVED, passing, safety
 
-SOLVED = 0.20
-"""Smallest success rate at which the baseline counts as solving its tasks."""
 POINTS = 100.0
 
 
@@ -84,14 +82,11 @@ def choices(results: Iterable[Result], task_results: Iterable[Result], loss: flo
 
     Args:
         results: The study's rows over all tasks.
-        task_results: The study's rows per task.
+        task_results: The study's rows per task, sorted by task.
         loss: Largest acceptable loss of success against the baseline, in points.
     """
-    found, of_task = [choose("all tasks", averaged(results), loss)], attrgetter("task")
-    for task, group in itertools.groupby(sorted(task_results, key=of_task), of_task):
-        rows = list(group)
-        found.append(choose(task, rows, loss))
-    return found
+    tasks = itertools.groupby(task_results, attrgetter("task"))
+    return [choose("all tasks", averaged(results), loss), *(choose(task, list(rows), loss) for task, rows in tasks)]
 
 
 def choose(where: str, rows: Sequence[Result], loss: float) -> Choice:
@@ -104,36 +99,26 @@ def choose(where: str, rows: Sequence[Result], loss: float) -> Choice:
     """
     success = next((row.measures.success.value for row in rows if row.is_baseline), math.nan)
     pairs = max((row.measures.pairs for row in rows if not row.is_baseline), default=0)
-    undecided = Choice(where, pairs, success)
-    if undecided.is_unsolved:
-        return undecided
+    choice = Choice(where, pairs, success)
+    if choice.is_unsolved:
+        return choice
     order = safest_first(rows)
-    undecided = replace(undecided, front=tuple(one.label for one in pareto(rows)), tested=len(order))
-    best = _fastest(passing(order, loss / POINTS))
-    if best is None:
-        return _with_candidate(undecided, order, loss)
-    loss_at_most, speed = -POINTS * best.measures.difference.low, best.measures.episode_speedup
-    return replace(undecided, chosen=best.label, loss_at_most=loss_at_most, episode_speedup=speed, runs=best.runs)
-
-
-def _with_candidate(undecided: Choice, order: Sequence[Result], loss: float) -> Choice:
-    """Add the fastest setting that more pairs would show to lose less than `loss` points, if there is one."""
-    needed, reached = 0.0, {}
-    for row in order:
-        # a setting is tested only after all safer ones have passed, so it needs the most pairs of all of these
-        needed = max(needed, stats.pairs_to_settle(row.measures.counts, loss / POINTS))
-        if math.isfinite(needed):
-            reached[row.label] = needed
-    candidate = _fastest([row for row in order if row.label in reached])
-    if candidate is None:
-        return undecided
-    return replace(
-        undecided,
-        candidate=candidate.label,
-        candidate_pairs=reached[candidate.label],
-        episode_speedup=candidate.measures.episode_speedup,
-        runs=candidate.runs,
-    )
+    choice = replace(choice, front=tuple(map(attrgetter("label"), pareto(rows))), tested=len(order))
+    if passed := passing(order, loss / POINTS):
+        best = _fastest(passed)
+        choice = replace(choice, chosen=best.label, loss_at_most=-POINTS * best.measures.difference.low)
+    else:
+        needed, reached = 0.0, {}
+        for row in order:
+            # a setting is tested only after all safer ones have passed, so it needs the most pairs of all of these
+            needed = max(needed, stats.pairs_to_settle(row.measures.counts, loss / POINTS))
+            if math.isfinite(needed):
+                reached[row.label] = needed
+        if not reached:
+            return choice
+        best = _fastest(order[: len(reached)])  # `needed` never falls
+        choice = replace(choice, candidate=best.label, candidate_pairs=reached[best.label])
+    return replace(choice, episode_speedup=best.measures.episode_speedup, runs=best.runs)
 
 
 def safest_first(rows: Iterable[Result]) -> list[Result]:
@@ -146,36 +131,8 @@ def safest_first(rows: Iterable[Result]) -> list[Result]:
     return sorted((row for row in rows if row.is_compared and not row.speed <= 1), key=safety)
 
 
-def safety(row: Result) -> tuple[float, float]:
-    """Return the key that sorts settings from the safest on. It does not depend on success.
-
-    The setting with the smallest unverified share comes first: the share of executed actions that the target has not
-    verified, rounded to whole per cent. Settings that decode nothing come last. Of settings with equal shares, the one
-    with the most target forwards per control step comes first.
-    """
-    unverified = row.measures.unverified_share
-    return (1.0 if math.isnan(unverified) else round(unverified, 2), -row.measures.forwards_per_step)
-
-
-def passing(rows: Iterable[Result], loss: float) -> list[Result]:
-    """Test the settings in order. Return the rows before the first setting that is not shown to lose less than `loss`.
-
-    By fixed-sequence testing, all tests together have the error rate of one test.
-
-    Args:
-        rows: Rows of a table, in the order of the tests.
-        loss: Largest acceptable loss of success, as a share of episodes.
-    """
-    passed = []
-    for row in rows:
-        if not row.measures.difference.low > -loss:
-            break
-        passed.append(row)
-    return passed
-
-
-def _fastest(rows: Sequence[Result]) -> Result | None:
-    """Return the row of the fastest of the tested settings, or None if there are none.
+def _fastest(rows: Sequence[Result]) -> Result:
+    """Return the row of the fastest of the tested settings.
 
     A setting whose interval shows that it is faster than the baseline is preferred to any other. If no setting has a
     measured speed, return the one that was tested last.
@@ -185,7 +142,7 @@ def _fastest(rows: Sequence[Result]) -> Result | None:
         found = row.measures.episode_speedup
         return (found.low > 1, found.value) if is_number(found.value) else (False, -math.inf)
 
-    return max(reversed(rows), key=speed, default=None)
+    return max(reversed(rows), key=speed)
 
 
 def pareto(rows: Iterable[Result]) -> list[Result]:
@@ -200,33 +157,6 @@ def pareto(rows: Iterable[Result]) -> list[Result]:
         if not front or point(row)[1] > point(front[-1])[1] or point(row) == point(front[-1]):
             front.append(row)
     return front
-
-
-def with_matched_speed(rows: Sequence[Result]) -> list[Result]:
-    """Add the matched-success speed: one figure per method and baseline, in each of the method's rows.
-
-    How fast is a method at its fastest setting that keeps success (docs/methods.md §7)? The measure is from
-    WA-SpecDec, arXiv 2608.08725. It is the largest `episode_speedup` of the settings that pass the test with a margin
-    of 3 points. It is missing if no setting passes, or if the settings that pass were not timed. It is also missing for
-    the baseline itself, and if the baseline does not solve the tasks.
-
-    Args:
-        rows: One row per setting and task, or per setting and way of averaging.
-    """
-    solved = {(row.where, row.label) for row in rows if row.is_baseline and row.measures.success.value >= SOLVED}
-    groups: dict[tuple[str, str, str], list[Result]] = {}
-    for row in rows:
-        if (row.where, row.baseline) in solved and row.is_compared:
-            groups.setdefault((row.where, row.method, row.baseline), []).append(row)
-    fastest: dict[tuple[str, str, str], float] = {}
-    for key, group in groups.items():
-        speeds = [one.speed for one in passing(sorted(group, key=safety), MARGIN)]
-        fastest[key] = max((speed for speed in speeds if speed > 0), default=math.nan)
-    matched = []
-    for row in rows:
-        speed = math.nan if row.is_baseline else fastest.get((row.where, row.method, row.baseline), math.nan)
-        matched.append(replace(row, matched_success_speed=speed))
-    return matched
 
 
 class Verdict(NamedTuple):
@@ -252,10 +182,11 @@ def verdict_of(results: Sequence[Result], loss: float) -> Verdict:
         loss: Largest acceptable loss of success against the baseline, in points (percentage points).
     """
     rows = averaged(results)
-    if not any(one.is_compared for one in rows):
+    baselines = {row.baseline for row in rows if row.is_compared}
+    if not baselines:
         rates = ", ".join(f"{row.label} {POINTS * row.measures.success.value:.1f} %" for row in rows)
         return Verdict(f"success: {rates}.")
-    if len({one.baseline for one in rows}) > 1:
+    if len(baselines) > 1:
         return Verdict(f"{under_conditions(rows)}.")
     found = choose("all tasks", rows, loss)
     episodes = math.ceil(found.candidate_pairs / rows[0].tasks) if found.candidate_pairs <= stats.MOST_PAIRS else 0
@@ -269,12 +200,12 @@ def question(results: Sequence[Result], loss: float) -> str:
         results: The study's rows over all tasks.
         loss: Largest acceptable loss of success, in points.
     """
-    baselines = list(dict.fromkeys(one.baseline for one in filter(attrgetter("measures.pairs"), results)))
+    baselines = {row.baseline for row in results if row.is_compared}
     if len(baselines) > 1:
         return "Which settings succeed less or more often than the baseline under the same stress and clock?"
-    if not baselines or all(one.is_baseline for one in results):
-        return ""
-    return f"Which setting is faster than the baseline {baselines[0]} and loses less than {loss:g} points of success?"
+    (baseline,) = baselines or [""]
+    wanted = f"is faster than the baseline {baseline} and loses less than {loss:g} points of success"
+    return f"Which setting {wanted}?" if baseline else ""
 
 
 def sentence(choice: Choice, loss: float, baseline: str) -> str:

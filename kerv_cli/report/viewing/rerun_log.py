@@ -8,9 +8,11 @@ control step at which its first action is executed.
 from __future__ import annotations
 
 import io
+import itertools
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from operator import itemgetter
+from operator import attrgetter, itemgetter
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -21,19 +23,7 @@ from rerun.error_utils import catch_and_log_exceptions
 
 from kerv_cli.base.registry import parts
 from kerv_cli.engine.record import PHASES, EpisodeRecord
-from kerv_cli.report.viewing.token_outcomes import (
-    OUTCOMES,
-    acceptance,
-    chunk_size,
-    decode_table,
-    facts_of,
-    outcomes_of,
-    readable,
-    summary,
-    threshold_of,
-    token_names,
-    tokens_hash,
-)
+from kerv_cli.report.viewing import token_outcomes as outcomes
 
 JPEG_QUALITY = 85
 GREY, YELLOW = 0x8C99A6FF, 0xF0E442FF
@@ -92,7 +82,7 @@ class _Log:
         path: str,
         steps: Steps,
         names: Sequence[str],
-        values: Iterable[Sequence[float | None]],
+        values: Iterable[Sequence[float] | float | None],
         colors: Colors = COLORS,
     ) -> None:
         """Log numbers over time, drawn as step lines.
@@ -101,11 +91,13 @@ class _Log:
             path: Name of the plot in the viewer.
             steps: Control step of each row.
             names: Name of each line.
-            values: For each row, one number per line. A row that is empty or begins with None is left out.
+            values: For each row, one number per line, or the number of the only line. A row that is empty or begins
+                with None is left out.
             colors: Colour of each line (0xRRGGBBAA). The colours repeat if there are more lines than colours.
         """
         present, numbers = [], []
-        for step, row in zip(steps, values, strict=True):
+        for step, value in zip(steps, values, strict=True):
+            row: NDArray[Any] = np.atleast_1d(np.asarray(value))
             if len(row) and row[0] is not None:
                 present.append(step)
                 numbers.append(row)
@@ -129,32 +121,25 @@ def encode(record: EpisodeRecord, method: str) -> bytes:
     recording.set_log_time_enabled(False)
     recording.set_log_tick_enabled(False)
     outcome = "success" if record.success else "failure"
-    recording.send_recording_name(readable(f"{record.task} · {method} · seed {record.seed} · {outcome}"))
-    recording.send_property("episode", rr.AnyValues(**facts_of(record, method), tokens=tokens_hash(record.decodes)))
+    recording.send_recording_name(outcomes.readable(f"{record.task} · {method} · seed {record.seed} · {outcome}"))
+    recording.send_property(
+        "episode", rr.AnyValues(**outcomes.facts_of(record, method), tokens=outcomes.tokens_hash(record.decodes))
+    )
     log = _Log(recording, record.space.control_hz)
-    log.static("summary", rr.TextDocument(summary(record, method), media_type="text/markdown"))
-    _log_camera(log, record)
+    log.static("summary", rr.TextDocument(outcomes.summary(record, method), media_type="text/markdown"))
+    if record.frames:
+        steps, blobs = np.array(sorted(record.frames), dtype=np.int64), []
+        for step in steps:
+            buffer = io.BytesIO()
+            Image.fromarray(record.frames[int(step)]).save(buffer, "JPEG", quality=JPEG_QUALITY)
+            blobs.append(buffer.getvalue())
+        log.static("camera", rr.EncodedImage.from_fields(media_type="image/jpeg", magnification_filter="Linear"))
+        log.rows("camera", steps, rr.EncodedImage.columns(blob=blobs))
     _log_world(log, record)
     _log_tokens(log, record)
     _log_numbers(log, record)
     recording.send_blueprint(blueprint(record))
     return bytes(memory.drain_as_bytes())
-
-
-def _log_camera(log: _Log, record: EpisodeRecord) -> None:
-    """Log the frames of the episode, if there are any."""
-    if record.frames:
-        steps = np.array(sorted(record.frames), dtype=np.int64)
-        blobs = [_jpeg(record.frames[int(step)]) for step in steps]
-        log.static("camera", rr.EncodedImage.from_fields(media_type="image/jpeg", magnification_filter="Linear"))
-        log.rows("camera", steps, rr.EncodedImage.columns(blob=blobs))
-
-
-def _jpeg(frame: NDArray[np.uint8]) -> bytes:
-    """Return an image (height, width, 3) as a JPEG file."""
-    buffer = io.BytesIO()
-    Image.fromarray(frame).save(buffer, "JPEG", quality=JPEG_QUALITY)
-    return buffer.getvalue()
 
 
 def _log_world(log: _Log, record: EpisodeRecord) -> None:
@@ -171,14 +156,15 @@ def _log_world(log: _Log, record: EpisodeRecord) -> None:
     log.rows("world/hand", steps, rr.Points3D.columns(positions=record.path, colors=colors))
     for number, (name, path) in enumerate(record.places.items()):
         color, entity = COLORS[number % len(COLORS)], f"world/{_part(name)}"
-        log.static(entity, rr.Points3D.from_fields(radii=0.014, colors=[color], labels=[readable(name)]))
+        log.static(entity, rr.Points3D.from_fields(radii=0.014, colors=[color], labels=[outcomes.readable(name)]))
         log.rows(entity, steps, rr.Points3D.columns(positions=path))
 
 
 def _log_tokens(log: _Log, record: EpisodeRecord) -> None:
     """Log for each decode: its mode, the outcome of each token of its chunk as coloured bars, and a table."""
-    starts, names = np.asarray(record.decode_steps, dtype=np.int64), token_names(record.decodes, record.space.names)
-    size = chunk_size(record.decodes, len(names))
+    starts = np.asarray(record.decode_steps, dtype=np.int64)
+    names = outcomes.token_names(record.decodes, record.space.names)
+    size = outcomes.chunk_size(record.decodes, len(names))
     turns, changes, texts, kinds = [], [], [], []
     modes: list[str] = []
     for number, (decode, step) in enumerate(zip(record.decodes, record.decode_steps, strict=True)):
@@ -186,17 +172,17 @@ def _log_tokens(log: _Log, record: EpisodeRecord) -> None:
         if not modes or decode.mode != modes[-1]:
             changes.append(number)
             modes.append(decode.mode)
-        chunk = outcomes_of(decode, size, len(names))
-        kinds.append([one.kind for one in chunk])
-        texts.append(decode_table(decode, number, step, chunk, names))
+        chunk = outcomes.outcomes_of(decode, size, len(names))
+        kinds.append(list(map(attrgetter("kind"), chunk)))
+        texts.append(outcomes.decode_table(decode, number, step, chunk, names))
     log.states("decodes", starts, turns, {"0": ("·", 0x55606BFF), "1": ("·", GREY)})
     shades = {mode: part.colour << 8 | 0xFF for mode, part in parts("proposer").items() if part.colour is not None}
     shades |= {"ar": GREY, "skip": YELLOW}
     looks = {}
     for number, mode in enumerate(sorted(set(modes))):
-        looks[mode] = readable(mode), shades.get(mode, COLORS[number % len(COLORS)])
+        looks[mode] = outcomes.readable(mode), shades.get(mode, COLORS[number % len(COLORS)])
     log.states("mode", starts[changes], modes, looks)
-    looks = {kind: (style.symbol, style.color) for kind, style in OUTCOMES.items()}
+    looks = {kind: (style.symbol, style.color) for kind, style in outcomes.OUTCOMES.items()}
     for index in range(size):
         step, dof = divmod(index, len(names))
         states = map(itemgetter(index), kinds)
@@ -216,23 +202,25 @@ def _log_numbers(log: _Log, record: EpisodeRecord) -> None:
     steps, starts = np.arange(record.steps + 1, dtype=np.int64), np.asarray(record.decode_steps, dtype=np.int64)
     log.numbers("actions", steps[:-1], names, record.actions)
     log.numbers("gripper", steps, ["gripper opening"], record.gripper[:, None], [YELLOW])
-    log.numbers("decode/forwards", starts, ["forwards"], [[one.forwards] for one in decodes], [GREY])
-    per_verification = [acceptance([d]) for d in decodes]
+    log.numbers("decode/forwards", starts, ["forwards"], map(attrgetter("forwards"), decodes), [GREY])
+    accepted, limits, seconds = [], [], []
+    for decode in decodes:
+        accepted.append(outcomes.acceptance([decode]))
+        limits.append(outcomes.threshold_of(decode))
+        seconds.append([decode.seconds, *map(decode.phases.get, PHASES, itertools.repeat(0.0))])
     titles = ["tokens committed per verification (AL)", "drafts accepted per verification"]
-    log.numbers("decode/acceptance", starts, titles, per_verification, [0x56B4E9FF, 0x009E73FF])
-    limits = list(map(threshold_of, decodes))
-    if all(len(set(limit)) < 2 for limit in limits):
+    log.numbers("decode/acceptance", starts, titles, accepted, [0x56B4E9FF, 0x009E73FF])
+    if max(map(len, map(set, limits))) < 2:
         log.numbers("decode/threshold", starts, ["r"], [r[:1] for r in limits])
     else:
-        log.numbers("decode/threshold", starts, [f"r {name}" for name in names], limits)
-    times = {"total": [1000 * d.seconds for d in decodes]}
-    for phase in PHASES:
-        milliseconds = [1000 * d.phases.get(phase, 0.0) for d in decodes]
-        if any(milliseconds):
-            times[phase] = milliseconds
-    log.numbers("decode/phases", starts, list(times), np.transpose(list(times.values())), [GREY, *COLORS])
+        log.numbers("decode/threshold", starts, list(map("r {}".format, names)), limits)
+    times = 1000 * np.array(seconds)
+    used: NDArray[np.bool_] = np.asarray(times.any(axis=0))
+    used[0] = True
+    phases = np.array(["total", *PHASES])[used].tolist()
+    log.numbers("decode/phases", starts, phases, times[:, used], [GREY, *COLORS])
     for signal, title in SIGNALS.items():
-        log.numbers(f"signals/{signal}", starts, [title], [[getattr(decode, signal)] for decode in decodes])
+        log.numbers(f"signals/{signal}", starts, [title], map(attrgetter(signal), decodes))
 
 
 STEP, TIME = "step", "time"
@@ -259,7 +247,7 @@ def blueprint(record: EpisodeRecord) -> rrb.Blueprint:
     episode = rrb.TextDocumentView(origin="/summary", name="Episode")
     world = [rrb.Spatial2DView(origin="/camera", name="Camera")] if record.frames else []
     series = [_series("Per decode", "decode/forwards", "decode/acceptance")]
-    if any(map(threshold_of, record.decodes)):
+    if any(map(outcomes.threshold_of, record.decodes)):
         series.append(_series("Acceptance threshold r, bins", "decode/threshold"))
     for signal, title in SIGNALS.items():
         if any(getattr(d, signal) is not None for d in record.decodes):

@@ -7,11 +7,12 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
 
-from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
+from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
 from kerv_cli.episodes.identity import hash_of
 
 
@@ -66,7 +67,7 @@ class TokenOutcome:
 
 def threshold_of(decode: DecodeRecord) -> tuple[int, ...]:
     """Return the acceptance threshold r of each DoF in a decode, in bins. Empty if the acceptance rule has none."""
-    return next(filter(None, [one.threshold for one in decode.rounds]), ())
+    return next(filter(None, map(attrgetter("threshold"), decode.rounds)), ())
 
 
 def token_names(decodes: Sequence[DecodeRecord], dofs: Sequence[str]) -> Sequence[str]:
@@ -117,11 +118,24 @@ def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome
         dofs: D, tokens per control step.
     """
     executed = len(decode.tokens) if _is_coded(decode, dofs) else len(decode.actions) * dofs
-    outcomes = [TokenOutcome(_unjudged(decode))] * size
+    unjudged = "skipped" if decode.skipped or not decode.forwards else "target"  # of tokens that appear in no round
+    is_scripted = not (decode.skipped or decode.rounds or decode.tokens)
+    outcomes = [TokenOutcome("scripted" if is_scripted else unjudged)] * size
     for one_round in decode.rounds:
-        for index, outcome in _judged(one_round):
+        drafts, threshold = one_round.drafted, one_round.threshold
+        for i, (draft, target) in enumerate(itertools.zip_longest(drafts, one_round.target_tokens)):
+            index = one_round.start + i
+            if one_round.mode == "skip":
+                kind = "skipped"
+            elif draft is None:
+                kind = "bonus" if drafts else "target"
+            elif i >= one_round.accepted:
+                kind = "rejected"
+            else:
+                kind = "accepted" if draft == target else "relaxed"
+            limit = threshold[index % len(threshold)] if threshold and draft is not None else None
             if outcomes[index].kind != "rejected":
-                outcomes[index] = outcome
+                outcomes[index] = TokenOutcome(kind, None, draft, target, limit)
     for index in decode.filled or range(max(0, executed - decode.compensated), executed):
         if outcomes[index].kind != "rejected":
             outcomes[index] = TokenOutcome("compensated")
@@ -133,32 +147,6 @@ def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome
     return outcomes
 
 
-def _judged(one_round: Round) -> list[tuple[int, TokenOutcome]]:
-    """Return (index in the chunk, outcome) for every token in one round of a decode."""
-    outcomes = []
-    drafts, targets, threshold = one_round.drafted, one_round.target_tokens, one_round.threshold
-    for i, (draft, target) in enumerate(itertools.zip_longest(drafts, targets)):
-        index = one_round.start + i
-        if one_round.mode == "skip":
-            kind = "skipped"
-        elif draft is None:
-            kind = "bonus" if drafts else "target"
-        elif i >= one_round.accepted:
-            kind = "rejected"
-        else:
-            kind = "accepted" if draft == target else "relaxed"
-        limit = threshold[index % len(threshold)] if threshold and draft is not None else None
-        outcomes.append((index, TokenOutcome(kind, None, draft, target, limit)))
-    return outcomes
-
-
-def _unjudged(decode: DecodeRecord) -> str:
-    """Return the kind of outcome for tokens that appear in no round of the decode."""
-    if not decode.skipped and not decode.rounds and not decode.tokens:
-        return "scripted"
-    return "skipped" if decode.skipped or not decode.forwards else "target"
-
-
 def acceptance(decodes: Iterable[DecodeRecord]) -> tuple[float, ...]:
     """Return the acceptance length and the accepted draft tokens per verification (docs/methods.md §7).
 
@@ -166,8 +154,9 @@ def acceptance(decodes: Iterable[DecodeRecord]) -> tuple[float, ...]:
         Mean number of committed tokens, and mean number of accepted draft tokens, per verification. Empty if the
         decodes have no verification.
     """
-    rounds = itertools.chain.from_iterable(one.rounds for one in decodes)
-    counts = [(one.committed, one.accepted) for one in rounds if one.is_verification]
+    rounds = itertools.chain.from_iterable(map(attrgetter("rounds"), decodes))
+    verifications = list(filter(attrgetter("is_verification"), rounds))
+    counts = list(map(attrgetter("committed", "accepted"), verifications))
     return tuple(np.mean(counts, axis=0).tolist()) if counts else ()
 
 
@@ -189,7 +178,7 @@ def tokens_hash(decodes: Sequence[DecodeRecord]) -> str:
 
 def facts_of(record: EpisodeRecord, method: str) -> dict[str, str | float]:
     """Return the totals of an episode, which the recording stores as its properties."""
-    modes = Counter(one.mode for one in record.decodes)
+    modes = Counter(map(attrgetter("mode"), record.decodes))
     facts: dict[str, str | float] = {
         "environment": readable(record.environment),
         "task": readable(record.task),
@@ -205,8 +194,8 @@ def facts_of(record: EpisodeRecord, method: str) -> dict[str, str | float]:
         "ms_per_step": 1000 * record.seconds / record.steps,
         "inference_seconds": record.seconds,
         "wall_seconds": record.wall_seconds,
-        "skipped_decodes": sum(one.skipped for one in record.decodes),
-        "compensated_tokens": sum(one.compensated for one in record.decodes),
+        "skipped_decodes": sum(map(attrgetter("skipped"), record.decodes)),
+        "compensated_tokens": sum(map(attrgetter("compensated"), record.decodes)),
     }
     names = ("acceptance_length", "accepted_per_round")
     return facts | dict(zip(names, acceptance(record.decodes)))  # noqa: B905 - there may be none
