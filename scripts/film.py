@@ -16,12 +16,12 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
-from kerv_cli.board.recorder import record_episode
+from kerv_cli.board.episode import record_episode
 from kerv_cli.catalogue.episodes import find_episode, outcomes
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import Study
-from kerv_cli.report.viewing.viewer import film_of
 from kerv_cli.report.viewing.token_outcomes import OUTCOMES, TokenOutcome, chunk_size, outcomes_of
+from kerv_cli.report.viewing.viewer import film_of
 
 SIDE, GAP, SQUARE, HEADER, FOOTER = 176, 8, 8, 22, 24
 """Pixels: edge of an image, gap between panels, edge of a token, height of the title and of the line of numbers."""

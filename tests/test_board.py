@@ -22,7 +22,7 @@ from starlette.testclient import TestClient
 from studies_synthetic import episode, swept, threshold_study, unhurried
 
 from kerv_cli.base.errors import KervError
-from kerv_cli.board import app, studies
+from kerv_cli.board import app, runs
 from kerv_cli.board.app import make_app
 from kerv_cli.episodes.rows import episode_row, seconds_blob
 from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, SETTINGS, WANTED, now, opened
@@ -294,7 +294,7 @@ def test_a_study_shows_numbers_on_hovering_and_differences_on_a_click(address, o
 
 
 def test_a_running_sweep_is_watched_until_it_ends(tmp_path, open_page, monkeypatch):
-    monkeypatch.setattr(studies, "_SHARE", 1.0)
+    monkeypatch.setattr(runs, "_SHARE", 1.0)
     sweep = threading.Thread(target=swept, args=(tmp_path, threshold_study(TASKS, 4, (3,), name="live"), unhurried))
     with served(tmp_path) as address:
         page = open_page(address)

@@ -25,9 +25,8 @@ from starlette.testclient import TestClient
 from studies_synthetic import episode, part, settings_of, study_of, swept, threshold_study
 
 from kerv_cli.board.app import make_app
-from kerv_cli.board.episode import RECORDER, command_of
+from kerv_cli.board.episode import RECORDER, command_of, record_episode
 from kerv_cli.board.episodes import phase_of
-from kerv_cli.board.recorder import record_episode
 from kerv_cli.catalogue.episodes import find_episode
 from kerv_cli.engine.record import Delay
 from kerv_cli.episodes.rows import decode_records, decodes_table

@@ -24,7 +24,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from kerv_cli.base.errors import KervError, UsageError
-from kerv_cli.board import episode, episodes, runs, studies, training
+from kerv_cli.board import episode, episodes, runs
 from kerv_cli.board.pages import render
 from kerv_cli.lab.database import Database
 
@@ -81,12 +81,13 @@ def make_app(database: Database) -> Starlette:
     folders = {"/static": ("kerv_cli.board", "static"), "/report": ("kerv_cli.report", "templates")}
     files = [Mount(path, StaticFiles(packages=[folder])) for path, folder in folders.items()]
     app = Starlette(
-        routes=[*runs.ROUTES, *studies.ROUTES, *episodes.ROUTES, *training.ROUTES, *files],
+        routes=[*runs.ROUTES, *episodes.ROUTES, *files],
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=_HOSTS), Middleware(SameOrigin)],
         exception_handlers=dict.fromkeys((KervError, HTTPException, Exception), failed),
     )
     app.state.database = database
     app.state.only = frozenset()  # ids of the runs to list; empty: all
+    app.state.live = True  # False: leave out what works only with the server
     return app
 
 

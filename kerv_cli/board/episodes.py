@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 from starlette.requests import Request
@@ -185,7 +186,7 @@ def _asked(request: Request) -> tuple[list[Cell], dict[str, Any]]:
     store = Study(database_of(request), request.path_params["name"])
     baseline, settings = settings_in(store)
     cells = cells_of(outcomes(store), baseline, settings)
-    known = {"setting": list(settings), "task": sorted(dict.fromkeys(one.task for one in cells))}
+    known = {"setting": list(settings), "task": sorted(set(map(attrgetter("task"), cells)))}
     chosen = {name: request.query_params.get(name, "") for name in known}
     for name, value in chosen.items():
         if value and value not in known[name]:
@@ -197,7 +198,7 @@ def _asked(request: Request) -> tuple[list[Cell], dict[str, Any]]:
 def show_episodes(request: Request) -> Response:
     """Show all episodes of a study as a grid."""
     cells, asked = _asked(request)
-    counts = Counter(one.kind for one in cells)
+    counts = Counter(map(attrgetter("kind"), cells))
     return render(request, "episodes.html", grids=grids_of(cells), counts=counts, outcomes=OUTCOMES, **asked)
 
 

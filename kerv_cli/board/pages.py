@@ -16,8 +16,8 @@ from starlette.responses import HTMLResponse, Response
 from kerv_cli.catalogue.entries import few
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import pulse
-from kerv_cli.report.summary import with_code
 from kerv_cli.report.measures import is_number
+from kerv_cli.report.summary import with_code
 
 TEMPLATES = Environment(
     loader=ChoiceLoader([PackageLoader("kerv_cli.board"), PackageLoader("kerv_cli.report")]),
@@ -76,12 +76,13 @@ def render(request: Request, template: str, status: int = 200, **values: Any) ->
     """Return a page.
 
     Args:
-        request: The request. Templates can read it, for example `request.url.path`.
+        request: The request. Templates can read it, for example `request.url.path`. Its app's `state.live` says whether
+            to show what works only with the server, such as forms.
         template: File in `templates/`.
         status: HTTP status.
         **values: Values that the template shows. They are escaped.
     """
-    text = TEMPLATES.get_template(template).render(request=request, **values)
+    text = TEMPLATES.get_template(template).render(request=request, live=request.app.state.live, **values)
     return HTMLResponse(text, status, {CONTENT_POLICY: _OWN_CONTENT})
 
 

@@ -1,20 +1,29 @@
-"""The start page with everything that the results folder holds, and the comparison of two runs."""
+"""The pages of runs: the start page, a study with its tables and charts, an artifact with its curves, a comparison."""
 
 from __future__ import annotations
 
+import functools
+import os
+import time
 from collections import Counter
 from collections.abc import Callable
 from itertools import starmap
-from urllib.parse import urlencode
+from operator import attrgetter
+from typing import Any
+from urllib.parse import quote, urlencode
 
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from kerv_cli.base.errors import UsageError
+from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.board.pages import database_of, refreshed, render
-from kerv_cli.catalogue.entries import RunEntry, find_runs
+from kerv_cli.catalogue.entries import RunEntry, children, description_of, disk_bytes, find_run, find_runs, parents
+from kerv_cli.lab.database import Database
+from kerv_cli.lab.runs import RUNNING, run_rows
+from kerv_cli.lab.store import Study
 from kerv_cli.report.compare import compare, pairs_to_compare
+from kerv_cli.report.tables import flatten
 
 STATES: dict[str, Callable[[RunEntry], bool]] = {
     "running": lambda run: run.is_running,
@@ -31,6 +40,10 @@ ORDERS: dict[str, Callable[[RunEntry], object]] = {
     "tasks": lambda run: run.tasks,
 }
 """Columns by which the table can be sorted. A minus before the name reverses the order."""
+_SHARE = 0.01
+"""Largest share of each core's time for refreshing the page of a running study, so that its times are not disturbed."""
+_SECONDS = 5.0
+"""Shortest time between two refreshes."""
 
 
 @refreshed
@@ -39,8 +52,13 @@ def show_runs(request: Request, version: str, is_live: bool) -> Response:
     asked = {name: request.query_params.get(name, "") for name in ("kind", "state", "text", "sort")}
     only = request.app.state.only
     every = [run for run in find_runs(database_of(request)) if not only or run.id in only]
-    kinds = Counter(one.kind for one in every)
-    runs = [run for run in every if _agrees(run, asked)]
+    kinds = Counter(map(attrgetter("kind"), every))
+    is_in_state = STATES.get(asked["state"], lambda run: True)
+    runs = []
+    for run in every:
+        words = " ".join((run.id, run.kind, *run.methods, *run.tasks, *run.labels.values())).lower()
+        if asked["kind"] in ("", run.kind) and is_in_state(run) and asked["text"].strip().lower() in words:
+            runs.append(run)
     order = asked["sort"].removeprefix("-")
     if order in ORDERS:
         runs.sort(key=ORDERS[order], reverse=asked["sort"].startswith("-"))  # type: ignore[arg-type]
@@ -66,12 +84,6 @@ def show_runs(request: Request, version: str, is_live: bool) -> Response:
     )
 
 
-def _agrees(run: RunEntry, asked: dict[str, str]) -> bool:
-    is_in_state = STATES.get(asked["state"], lambda run: True)
-    words = " ".join((run.id, run.kind, *run.methods, *run.tasks, *run.labels.values())).lower()
-    return asked["kind"] in ("", run.kind) and is_in_state(run) and asked["text"].strip().lower() in words
-
-
 def show_comparison(request: Request) -> Response:
     """Show how two runs differ in settings and results: `/compare?run=A&run=B`."""
     names = request.query_params.getlist("run")
@@ -81,4 +93,126 @@ def show_comparison(request: Request) -> Response:
     return render(request, "compare.html", names=names, comparisons=list(starmap(compare, pairs)))
 
 
-ROUTES = [Route("/", show_runs), Route("/compare", show_comparison)]
+@functools.lru_cache(maxsize=16)
+def _parts(database: Database, name: str, version: str, is_running: bool) -> tuple[dict[str, Any], float]:
+    """Return the values of a study's report, and the seconds to wait before the next refresh.
+
+    Args:
+        database: The database.
+        name: Name of the study.
+        version: `Study.version` of the study. A study is read again only if its version has changed.
+        is_running: Whether the study is running. Then a cost model does not estimate its speeds, because that would
+            slow the study down.
+    """
+    from kerv_cli.report.report import Report, study_parts  # imports Altair, which takes a second
+    from kerv_cli.report.reprice import own_prices
+    from kerv_cli.report.tables import load_study
+
+    began = time.thread_time()
+    data = load_study(Study(database, name))
+    priced = [] if is_running else own_prices(data, elsewhere=False)
+    parts = study_parts(Report(data, priced=priced))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return parts, max(_SECONDS, (time.thread_time() - began) / (_SHARE * cores))
+
+
+@refreshed
+def show_study(request: Request, version: str, is_live: bool) -> Response:
+    """Show how far a study is. The tables follow in a second request, because many episodes take time to read."""
+    database = database_of(request)
+    runs = find_runs(database)
+    run = next((run for run in runs if run.id == request.path_params["name"] and run.has_episodes), None)
+    if run is None:
+        raise UsageError(f"there is no study '{request.path_params['name']}'")
+    page = render(
+        request,
+        "study_page.html",
+        run=run,
+        title=run.id,
+        parents=parents(run, runs),
+        known=set(map(attrgetter("id"), runs)),
+        version=version,
+        is_live=is_live and run.is_running,
+    )
+    if not run.is_running:
+        page.headers["HX-Trigger"] = "ended"  # tables that show the running study are loaded again
+    return page
+
+
+def show_tables(request: Request) -> Response:
+    """Show the report of a study: its verdict, tables and charts."""
+    database, name = database_of(request), request.path_params["name"]
+    store = Study(database, name)
+    is_running = RUNNING in map(attrgetter("status"), run_rows(database, store.kind, name))
+    version = f"{store.version()}/{is_running}"
+    if request.query_params.get("known") == version:
+        return Response(status_code=204)
+    has_episodes = store.counts()[0] > 0
+    parts, seconds = _parts(database, name, version, is_running) if has_episodes else ({}, _SECONDS)
+    hidden: dict[str, Any] = {"recordings": [], "files": []} | ({"missing": 0} if is_running else {})
+    if len(parts.get("settings", ())) == 1:
+        hidden["charts"] = []  # nothing to compare
+    return render(
+        request,
+        "study_tables.html",
+        study=name,
+        has_episodes=has_episodes,
+        is_running=is_running,
+        version=version,
+        seconds=round(seconds),
+        **parts | hidden | {"episodes": f"/studies/{quote(name)}/episodes"},
+    )
+
+
+def send_library(request: Request) -> Response:
+    """Send the library that draws charts."""
+    from kerv_cli.report.plots import library
+
+    return Response(library(), media_type="text/javascript", headers={"cache-control": "max-age=86400"})
+
+
+@refreshed
+def show_artifact(request: Request, version: str, is_live: bool) -> Response:
+    """Show one artifact, and its curves while it is trained."""
+    database = database_of(request)
+    runs = find_runs(database)
+    run = find_run(database, request.path_params["name"], exact=True)
+    if not run.folder.is_relative_to(database.results):
+        raise UsageError(f"{run.id} is outside {database.results}")
+    described = description_of(run)
+    return render(
+        request,
+        "artifact.html",
+        run=run,
+        size=disk_bytes(run.folder),
+        parents=parents(run, runs),
+        children=children(run, runs),
+        known=set(map(attrgetter("id"), runs)),
+        chart=_curves(run),
+        settings=flatten(described.get("settings", {})),
+        commit=described.get("git_commit", ""),
+        version=version,
+        is_live=is_live and run.is_running,
+    )
+
+
+def _curves(run: RunEntry) -> dict[str, object] | None:
+    """Return a training's curves as a Vega-Lite chart. None for other artifacts, and before the second validation."""
+    from kerv_cli.report.plots import curves_figure, read_log
+
+    try:
+        log = read_log(run.folder)
+    except KervError:
+        return None
+    first = [name for name in ("step", "score", "train_loss") if name in log]
+    return curves_figure(log[[*first, *log.columns.drop(first)]]).to_dict() if len(log) > 1 else None
+
+
+ROUTES = [
+    Route("/", show_runs),
+    Route("/compare", show_comparison),
+    Route("/studies/{name}", show_study),
+    Route("/studies/{name}/tables", show_tables),
+    Route("/report/charts.js", send_library),
+    Route("/artifacts/{name:path}", show_artifact),
+]
