@@ -117,28 +117,17 @@ def save_episode(path: Path, episode: DemoEpisode, level: int = 6) -> None:
             **{name: getattr(episode, attribute) for attribute, name in _ARRAYS.items()},
         }
         # Not safetensors' save_file: on a full disk it raises its own type of error.
-        file.write(_with_pictures(save(tensors, metadata=metadata), sum(sizes)))
+        data = save(tensors, metadata=metadata)
+        header, start = header_of(data)
+        begin = len(data) - start  # safetensors writes tensors of bytes last
+        header["png"] |= {"shape": [sum(sizes)], "data_offsets": [begin, begin + sum(sizes)]}
+        # safetensors writes the keys in random order, which would give equal recordings different hashes
+        header["__metadata__"] = dict(sorted(metadata.items()))
+        text = json.dumps(header, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 8)  # arrays start at a multiple of eight
+        file.write(LENGTH.pack(len(text)) + text + data[start:])
         pictures.seek(0)
         shutil.copyfileobj(pictures, file)
-
-
-def _with_pictures(data: bytes, size: int) -> bytes:
-    """Return the bytes of a safetensors file up to its last tensor, `png`. Sort the keys of its metadata.
-
-    safetensors writes the keys in random order. Without sorting, two recordings of the same episode would have
-    different hashes. It writes tensors of bytes last.
-
-    Args:
-        data: The file with an empty `png`.
-        size: Number of bytes of `png`.
-    """
-    header, start = header_of(data)
-    begin = len(data) - start
-    header["png"] |= {"shape": [size], "data_offsets": [begin, begin + size]}
-    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
-    text = json.dumps(header, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 8)  # arrays start at a multiple of eight
-    return LENGTH.pack(len(text)) + text + data[start:]
 
 
 def load_episode(path: Path) -> DemoEpisode:
@@ -321,31 +310,12 @@ def memory_limit(size: int) -> Iterator[None]:
 
 
 def foreign_table(source: Path | bytes, columns: Sequence[str] = (), most: int = 0) -> pa.Table:
-    """Read a table from a Parquet file of any origin.
+    """Read a table from a Parquet file of any origin, part by part, so that its size can be limited.
 
     Args:
         source: The file's path or its bytes.
         columns: Names of the columns to read. Names that the file lacks are ignored. Empty: all columns.
         most: Largest size of all rows in memory, in bytes. 0: MOST_EXPANDED.
-
-    Raises:
-        OSError: The file is missing or is no Parquet file.
-        ValueError: The file is damaged, or takes more than `most` bytes in memory.
-    """
-    batches = list(foreign_batches(source, columns, most))
-    return pa.Table.from_batches(batches[1:], batches[0].schema)
-
-
-def foreign_batches(source: Path | bytes, columns: Sequence[str] = (), most: int = 0) -> Iterator[pa.RecordBatch]:
-    """Yield the rows of a Parquet file of any origin, part by part, so that their size can be limited.
-
-    Args:
-        source: The file's path or its bytes.
-        columns: Names of the columns to read. Names that the file lacks are ignored. Empty: all columns.
-        most: Largest size of all rows in memory, in bytes. 0: MOST_EXPANDED.
-
-    Yields:
-        First a batch without rows, then the rows.
 
     Raises:
         OSError: The file is missing or is no Parquet file.
@@ -356,19 +326,23 @@ def foreign_batches(source: Path | bytes, columns: Sequence[str] = (), most: int
     too_large = ValueError(f"{name} expands to more than {most // 2**20} MiB in memory: split it")
     with pq.ParquetFile(io.BytesIO(source) if isinstance(source, bytes) else regular(source)) as file:
         chosen = [column for column in file.schema_arrow.names if not columns or column in columns]
-        fields = [file.schema_arrow.field(column) for column in chosen]
-        yield pa.RecordBatch.from_pylist([], pa.schema(fields, file.schema_arrow.metadata))
-        sizes = [_expanded(file.metadata, n, chosen) for n in range(file.num_row_groups)]
-        if max((size for size, _ in sizes), default=0) > most:
-            raise too_large
+        schema = pa.schema([file.schema_arrow.field(column) for column in chosen], file.schema_arrow.metadata)
+        largest = 1
+        for group in range(file.num_row_groups):
+            size, text = _expanded(file.metadata, group, chosen)
+            largest = max(largest, text)
+            if size > most:
+                raise too_large
         # a cell of text can repeat: it is at most as large as its row group in the file
-        rows = max(1, min(_BATCH, min(most, _BATCH_BYTES) // max((text for _, text in sizes), default=1)))
+        rows = max(1, min(_BATCH, min(most, _BATCH_BYTES) // largest))
+        batches = []
         # not pyarrow's dataset scanner, which would expand whole row groups before the total can be checked
         for batch in file.iter_batches(rows, None, chosen, use_threads=False):
             total += batch.nbytes
             if total > most:
                 raise too_large
-            yield batch
+            batches.append(batch)
+    return pa.Table.from_batches(batches, schema)
 
 
 def _expanded(metadata: pq.FileMetaData, group: int, columns: Sequence[str]) -> tuple[int, int]:

@@ -12,9 +12,8 @@ import io
 import itertools
 import math
 import re
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -38,14 +37,7 @@ from kerv_cli.worlds.demos.dataset import (
     episode_path,
     totals,
 )
-from kerv_cli.worlds.demos.files import (
-    DemoEpisode,
-    StreamedFrames,
-    foreign_batches,
-    foreign_table,
-    memory_limit,
-    save_episode,
-)
+from kerv_cli.worlds.demos.files import DemoEpisode, StreamedFrames, foreign_table, memory_limit, save_episode
 from kerv_cli.worlds.settings import DemosImportSettings
 from kerv_cli.worlds.spec import EnvironmentSpec
 
@@ -72,7 +64,6 @@ ROWS_RATIO, PICTURES_RATIO, VIDEO_RATIO = 8, 64, 2048
 """Bytes in memory that rows, pictures and video frames may take per byte of their file. Any file may take ALLOWED."""
 EPISODE_BYTES, FEW_EPISODES = 1024, 500
 """A data file with more than FEW_EPISODES episodes is refused if it has fewer than EPISODE_BYTES bytes per episode."""
-_MOST_REWINDS = 10  # of a data file whose episodes are not in order
 _MEMORY = 3 * 2**29  # bytes, beyond what the process has
 # PIL raises SyntaxError
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, SyntaxError, Image.DecompressionBombError)
@@ -92,6 +83,7 @@ class Source:
         tasks: The instructions by `task_index`, the number of a task.
         camera: Name of the camera to read.
         key: Name of the feature with the camera's images.
+        taken: Bytes in memory that the images of each file take.
     """
 
     folder: Path
@@ -100,6 +92,7 @@ class Source:
     tasks: Mapping[int, str]
     camera: str
     key: str
+    taken: dict[Path, int] = field(default_factory=dict)
 
     @classmethod
     def open(cls, folder: Path, camera: str) -> Source:
@@ -139,12 +132,14 @@ class Source:
         camera_file = [f"videos/{keys[camera]}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
         columns = ["episode_index", "length", "data/chunk_index", "data/file_index", *camera_file]
         paths = sorted(folder.glob("meta/episodes/[!.]*/[!.]*.parquet"))
-        tables = [_table(path, columns, MOST_NAMED) for path in paths]
-        if sum(map(len, tables)) > MOST_EPISODES:
-            raise CheckpointError(f"{paths[0].parent} names more than {MOST_EPISODES} episodes: split the dataset")
-        rows = sorted(itertools.chain(*(table.to_pylist() for table in tables)), key=itemgetter("episode_index"))
+        rows: list[Row] = []
+        for path in paths:
+            rows += _table(path, columns, MOST_NAMED).to_pylist()
+            if len(rows) > MOST_EPISODES:
+                raise CheckpointError(f"{path.parent} names more than {MOST_EPISODES} episodes: split the dataset")
         if not rows:
             raise CheckpointError(f"{folder / 'meta/episodes'} is missing or names no episode: copy the dataset again")
+        rows.sort(key=itemgetter("episode_index"))
         columns = ["task_index", "task", "__index_level_0__"]
         names = _table(folder / TASKS, columns, MOST_NAMED).to_pylist()
         tasks = {int(row["task_index"]): str(row.get("task", row.get("__index_level_0__"))) for row in names}
@@ -197,122 +192,39 @@ class Source:
         """Return the path of the data file of an episode, see `path`."""
         return self.path(episode, "data", self.info.get("data_path") or DATA)
 
-    def frames(self, episode: Row, table: pa.Table, limits: Limits) -> StreamedFrames:
+    def frames(self, episode: Row, table: pa.Table) -> StreamedFrames:
         """Return the images (T, height, width, 3) uint8 of one episode.
 
         Args:
             episode: The episode's row in meta/episodes.
             table: The episode's rows.
-            limits: Counts the memory that the images of each file take.
 
         Raises:
-            CheckpointError: A file is missing or damaged, or its images take too much memory.
+            CheckpointError: A file is missing or damaged. Or its images, those of earlier episodes included, take more
+                memory than its size allows.
         """
+        count = len(table)
         if self.info["features"][self.key]["dtype"] == "image":
-            path, cells = self.data_path(episode), table[self.key]
-            with _picture(cells[0].as_py(), self.folder, path) as first:
-                size = first.size
-            images, ratio = _pictures(cells, self.folder, path, size), PICTURES_RATIO
+            path, ratio = self.data_path(episode), PICTURES_RATIO
+            images = _pictures(table[self.key], self.folder, path)
         else:
             path = self.path(episode, f"videos/{self.key}", self.info.get("video_path") or VIDEO)
-            size, ratio = _video_size(path), VIDEO_RATIO
-            start, rate = float(episode[f"videos/{self.key}/from_timestamp"]), float(self.info["fps"])
-            images = _video_frames(path, start, rate, len(table), size)
-        shape = (len(table), size[1], size[0], 3)
-        limits.take(path, math.prod(shape), ratio, f"the {len(table)} images of an episode")
-        return StreamedFrames(shape, images)
-
-
-class Limits:
-    """Counts the memory that each file's images take. Refuses a file whose images take too much for the file's size."""
-
-    def __init__(self) -> None:
-        self.taken: dict[Path, int] = {}
-
-    def take(self, path: Path, size: int, ratio: int, what: str) -> None:
-        """Add `size` bytes to the memory that the images of a file take.
-
-        Args:
-            path: The file.
-            size: Number of bytes in memory.
-            ratio: How many bytes in memory are allowed per byte of the file.
-            what: Which images take the memory, for the error message.
-
-        Raises:
-            CheckpointError: The file's images take more memory than the ratio allows, and more than ALLOWED.
-        """
+            start, ratio = float(episode[f"videos/{self.key}/from_timestamp"]), VIDEO_RATIO
+            images = _video_frames(path, start, float(self.info["fps"]), count)
+        first = next(images)
+        size, most = count * first.size, allowed(path, ratio)
         self.taken[path] = self.taken.get(path, 0) + size
-        most = allowed(path, ratio)
         if self.taken[path] > most:
             raise CheckpointError(
-                f"{path}: {what} take {size // 2**20} MiB in memory, with the episodes before "
-                f"{self.taken[path] // 2**20}; at most {most // 2**20} MiB are read from a file of this size"
+                f"{path}: the {count} images of an episode take {size // 2**20} MiB in memory, with the episodes "
+                f"before {self.taken[path] // 2**20}; at most {most // 2**20} MiB are read from a file of this size"
             )
-
-
-def _batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
-    """Yield the rows of a data file with `foreign_batches`, and name the file in every error."""
-    with _reading(path):
-        yield from foreign_batches(path, columns, allowed(path, ROWS_RATIO))
+        return StreamedFrames((count, *first.shape), _alike(first, images, path))
 
 
 def allowed(path: Path, ratio: int) -> int:
     """Return how many bytes the contents of a file may take in memory, at `ratio` bytes per byte of the file."""
     return max(ALLOWED, ratio * path.stat().st_size)
-
-
-class DataFile:
-    """The rows of a data file. They are read once, from the beginning to the end.
-
-    Args:
-        path: The file.
-        columns: Names of the columns to read.
-    """
-
-    def __init__(self, path: Path, columns: Sequence[str]) -> None:
-        self.path, self.columns = path, columns
-        self._rewinds = 0
-        self._begin()
-
-    def _begin(self) -> None:
-        self._batches = _batches(self.path, self.columns)
-        self._rest = next(self._batches)
-
-    def rows(self, episode: int, length: int) -> pa.Table:
-        """Return the rows of one episode, in order.
-
-        Args:
-            episode: Number of the episode.
-            length: Number of rows of the episode.
-
-        Raises:
-            CheckpointError: Rows are missing, or the file is damaged.
-        """
-        found = self._next_rows(episode)
-        if not found:  # they may come before the rows of the episode that was read last
-            self._rewinds += 1
-            if self._rewinds <= _MOST_REWINDS:
-                self._begin()
-                found = self._next_rows(episode)
-        count = sum(map(len, found))
-        if not count or count != length:
-            raise CheckpointError(f"{self.path} has {count} rows of episode {episode} in order, not its length")
-        return pa.Table.from_batches(found)
-
-    def _next_rows(self, episode: int) -> list[pa.RecordBatch]:
-        """Return the next rows in a row that belong to an episode. Empty: none is left."""
-        found: list[pa.RecordBatch] = []
-        for batch in itertools.chain([self._rest], self._batches):
-            is_mine = batch["episode_index"].to_numpy(zero_copy_only=False) == episode
-            first = 0 if found else int(is_mine.argmax()) if is_mine.any() else len(batch)
-            others = np.flatnonzero(~is_mine[first:])
-            stop = first + int(others[0]) if len(others) else len(batch)
-            if stop > first:
-                found.append(batch.slice(first, stop - first))
-            self._rest = batch.slice(stop)
-            if found and stop < len(batch):
-                break
-        return found
 
 
 def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProgress) -> DemoDataset:
@@ -354,26 +266,28 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
         check_recorded(environment)
     entries: dict[str, list[EpisodeEntry]] = {}
     limits: list[np.ndarray] = []
-    state, taken = 0, Limits()
-    paths = [source.data_path(row) for row in chosen]
-    _check_episodes(paths)
-    file: DataFile | None = None
-    for done, (path, row) in enumerate(sorted(zip(paths, chosen, strict=True), key=lambda pair: pair[0])):
-        if file is None or file.path != path:
-            file = DataFile(path, ["episode_index", "task_index", *VECTORS, source.key])
-        episode = _episode(source, row, file, names, settings.tail, taken)
-        limits.append(np.stack([episode.executed.min(0), episode.executed.max(0)]))
-        state = episode.states.shape[1]
-        path = episode_path(folder, episode.task, episode.seed)
-        save_episode(path, episode, level=1)  # a small file may hold many pixels
-        entries.setdefault(episode.task, []).append(EpisodeEntry.of(path, episode))
-        progress(done + 1, len(chosen))
+    state, done = 0, 0
+    of_files: dict[Path, list[Row]] = {}
+    for row in chosen:
+        of_files.setdefault(source.data_path(row), []).append(row)
+    for path, rows in of_files.items():
+        _check_episodes(path, len(rows))
+    for path, rows in of_files.items():
+        table = _table(path, ["episode_index", "task_index", *VECTORS, source.key], allowed(path, ROWS_RATIO))
+        for row in rows:
+            episode = _episode(source, row, path, table, names, settings.tail)
+            limits += [episode.executed.min(0), episode.executed.max(0)]
+            state, done = episode.states.shape[1], done + 1
+            saved = episode_path(folder, episode.task, episode.seed)
+            save_episode(saved, episode, level=1)  # a small file may hold many pixels
+            entries.setdefault(episode.task, []).append(EpisodeEntry.of(saved, episode))
+            progress(done, len(chosen))
     proprioception = tuple(source.names(STATE, "state")[:state])
     if world:
         space, instructions = world.actions, {}
         observation = _observation(source, state, world)
     else:
-        space = action_space(source, settings, np.concatenate(limits))
+        space = action_space(source, settings, np.array(limits))
         observation = ObservationSpace(proprioception, state, (), (0.0, 0.0, 0.0))
         instructions = {names[i]: text for i, text in source.tasks.items() if names[i] in entries}
     recording = {
@@ -444,57 +358,58 @@ def _observation(source: Source, state: int, world: EnvironmentSpec) -> Observat
     )
 
 
-def _check_episodes(paths: Sequence[Path]) -> None:
-    """Refuse data files that hold more episodes than fit into them.
+def _check_episodes(path: Path, count: int) -> None:
+    """Refuse a data file that holds more episodes than fit into it.
 
     Args:
-        paths: Path of the data file of each episode.
+        path: The file.
+        count: Number of its episodes.
 
     Raises:
-        CheckpointError: A file holds more than FEW_EPISODES episodes, and they have less than EPISODE_BYTES each.
+        CheckpointError: The file holds more than FEW_EPISODES episodes, and they have less than EPISODE_BYTES each.
     """
-    for path, count in Counter(paths).items():
-        with _reading(path):
-            most = max(FEW_EPISODES, path.stat().st_size // EPISODE_BYTES)
-        if count > most:
-            raise CheckpointError(
-                f"{path} holds {count} episodes, at most {most} are read from a file of this size: give episodes=N"
-            )
+    with _reading(path):
+        most = max(FEW_EPISODES, path.stat().st_size // EPISODE_BYTES)
+    if count > most:
+        raise CheckpointError(
+            f"{path} holds {count} episodes, at most {most} are read from a file of this size: give episodes=N"
+        )
 
 
-def _episode(
-    source: Source, row: Row, file: DataFile, names: Mapping[int, str], tail: int, taken: Limits
-) -> DemoEpisode:
+def _episode(source: Source, row: Row, path: Path, table: pa.Table, names: Mapping[int, str], tail: int) -> DemoEpisode:
     """Convert one episode.
 
     Args:
         source: The LeRobot dataset.
         row: The episode's row in meta/episodes.
-        file: The data file of the episode.
+        path: The data file of the episode.
+        table: The rows of that file.
         names: The names of the tasks by `task_index`.
         tail: Number of copies of the last action to append to the labels.
-        taken: Counts the memory that the images of each file take, earlier episodes included.
 
     Raises:
         CheckpointError: Rows are missing, a file is damaged or too large, or a number is not finite.
     """
-    number = int(row["episode_index"])
-    with _reading(file.path):
-        table = file.rows(number, int(row["length"]))
+    number, length = int(row["episode_index"]), int(row["length"])
+    with _reading(path):
+        table = table.filter(pc.equal(table["episode_index"], number))
+        if not 0 < len(table) == length:
+            raise CheckpointError(f"{path} has {len(table)} rows of episode {number}, not its length")
         columns = {name: _vectors(table, name) for name in VECTORS if name in table.column_names}
         task = names[int(table["task_index"][0].as_py())]
-    if not all(np.isfinite(values).all() for values in columns.values()):
-        raise CheckpointError(f"{file.path}: episode {number} holds numbers that are not finite")
+    for values in columns.values():
+        if not np.isfinite(values).all():
+            raise CheckpointError(f"{path}: episode {number} holds numbers that are not finite")
     labels = columns[ACTION]
-    states = columns.get(ENVIRONMENT, columns.get(STATE, np.zeros((len(table), 0), np.float32)))
-    frames: Any = source.frames(row, table, taken)  # `save_episode` reads them once
+    states = columns.get(ENVIRONMENT, columns.get(STATE, np.zeros((length, 0), np.float32)))
+    frames: Any = source.frames(row, table)  # `save_episode` reads them once
     return DemoEpisode(
         task=task,
         seed=number,
         perturbed=False,
-        steps=len(table),
+        steps=length,
         frames=frames,
-        frame_steps=np.arange(len(table), dtype=np.int64),
+        frame_steps=np.arange(length, dtype=np.int64),
         states=states,
         labels=np.concatenate([labels, np.repeat(labels[-1:], tail, 0)]),
         executed=columns.get(EXECUTED, labels),
@@ -627,92 +542,72 @@ def _vectors(table: pa.Table, name: str) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def _picture(cell: Row, folder: Path, path: Path) -> Image.Image:
-    """Open an image in a cell of a table, which holds the image's bytes or its path below `folder`.
+def _pictures(cells: pa.ChunkedArray, folder: Path, path: Path) -> Iterator[np.ndarray]:
+    """Yield the decoded images (height, width, 3) uint8 of the cells of a table.
+
+    A cell holds an image's bytes or its path below `folder`.
 
     Args:
-        cell: The cell.
+        cells: The cells.
         folder: Folder of the dataset.
         path: File of the table.
 
     Raises:
-        CheckpointError: The image is missing or damaged.
-    """
-    data = cell.get("bytes")
-    place = path if data else _below(folder, str(cell.get("path")))
-    with _reading(place):
-        return Image.open(io.BytesIO(data) if data else regular(place))
-
-
-def _pictures(cells: pa.ChunkedArray, folder: Path, path: Path, size: tuple[int, int]) -> Iterator[np.ndarray]:
-    """Yield the decoded images (height, width, 3) uint8 of the cells of a table, see `_picture`.
-
-    Raises:
-        CheckpointError: An image is missing or damaged, or its (width, height) is not `size`.
+        CheckpointError: An image is missing or damaged.
     """
     for cell in cells:
-        with _picture(cell.as_py(), folder, path) as image, _reading(path):
-            _check_size(image.size, size)
+        value = cell.as_py()
+        data = value.get("bytes")
+        place = path if data else _below(folder, str(value.get("path")))
+        with _reading(place), Image.open(io.BytesIO(data) if data else regular(place)) as image:
             yield np.asarray(image.convert("RGB"))
 
 
-def _check_size(found: tuple[int, int], size: tuple[int, int]) -> None:
-    """Raise a ValueError if the (width, height) of an image is not that of the first image of its episode."""
-    if found != size:
-        raise ValueError(f"an image has {found[0]} x {found[1]} pixels, the first of its episode {size[0]} x {size[1]}")
-
-
-@contextlib.contextmanager
-def _opened_video(path: Path) -> Iterator[Any]:
-    """Open a video for reading, and name it in every error.
+def _alike(first: np.ndarray, others: Iterator[np.ndarray], path: Path) -> Iterator[np.ndarray]:
+    """Yield the images of an episode, which are in the file `path`.
 
     Raises:
-        KervError: The package av is not installed.
-        CheckpointError: The video is missing or damaged.
+        CheckpointError: An image has another size than the first.
     """
-    try:
-        import av
-    except ImportError as error:
-        raise KervError("datasets with videos need the package av: pip install 'kerv[lerobot]'") from error
+    height, width, _ = first.shape
     with _reading(path):
-        try:
-            with av.open(str(regular(path))) as container:
-                yield container
-        except av.error.FFmpegError as error:
-            raise ValueError(str(error)) from error
+        for image in itertools.chain([first], others):
+            if image.shape != first.shape:
+                size = f"{image.shape[1]} x {image.shape[0]}"
+                raise ValueError(f"an image has {size} pixels, the first of its episode {width} x {height}")
+            yield image
 
 
-def _video_size(path: Path) -> tuple[int, int]:
-    """Return width and height of the images of a video; raises as `_opened_video`."""
-    with _opened_video(path) as container:
-        codec = container.streams.video[0].codec_context
-        return codec.width, codec.height
-
-
-def _video_frames(path: Path, start: float, rate: float, count: int, size: tuple[int, int]) -> Iterator[np.ndarray]:
-    """Yield the frames of a video that are nearest to the times start, start + 1 / rate, ….
+def _video_frames(path: Path, start: float, rate: float, count: int) -> Iterator[np.ndarray]:
+    """Yield the frames (height, width, 3) uint8 of a video that are nearest to the times start, start + 1 / rate, ….
 
     Args:
         path: The video.
         start: First time, in seconds.
         rate: Frames per second.
         count: Number of frames.
-        size: (width, height) of the frames.
 
     Raises:
         KervError: The package av is not installed.
-        CheckpointError: The video is missing, damaged or too short, or has frames of another size.
+        CheckpointError: The video is missing, damaged or too short.
     """
-    with _opened_video(path) as container:
-        stream = container.streams.video[0]
-        if start > 0:
-            container.seek(int(start / float(stream.time_base)), stream=stream)
-        done, half = 0, 0.5 / rate
-        for frame in container.decode(stream):
-            _check_size((frame.width, frame.height), size)
-            while done < count and float(frame.time) >= start + done / rate - half:
-                yield frame.to_ndarray(format="rgb24")
-                done += 1
-            if done == count:
-                return
+    try:
+        import av
+    except ImportError as error:
+        raise KervError("datasets with videos need the package av: pip install 'kerv[lerobot]'") from error
+    done, half = 0, 0.5 / rate
+    with _reading(path):
+        try:
+            with av.open(str(regular(path))) as container:
+                stream = container.streams.video[0]
+                if start > 0:
+                    container.seek(int(start / float(stream.time_base)), stream=stream)
+                for frame in container.decode(stream):
+                    while done < count and float(frame.time) >= start + done / rate - half:
+                        yield frame.to_ndarray(format="rgb24")
+                        done += 1
+                    if done == count:
+                        return
+        except av.error.FFmpegError as error:
+            raise ValueError(str(error)) from error
     raise CheckpointError(f"{path} ends {count - done} frames before its episode does")
