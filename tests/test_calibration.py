@@ -5,7 +5,7 @@ import dataclasses
 import json
 import shutil
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
@@ -106,7 +106,7 @@ def write_dataset(
         save_episode(path, episode)
         entry = {"seed": seed, "perturbed": episode.perturbed, "steps": episode.steps}
         tasks[task]["episodes"].append({**entry, "bytes": path.stat().st_size, "sha256": sha256_of(path)})
-    spaces = {"actions": SPACE.as_dict(), "observation": SPEC.observation.as_dict()}
+    spaces = {"actions": SPACE.as_dict(), "observation": asdict(SPEC.observation)}
     described = {"format": FORMAT, "environment": SPEC.name, **spaces, "config": {"camera": {"name": SPEC.cameras[0]}}}
     write_json(folder / "manifest.json", {**described, "sha256": dataset_hash(tasks), "tasks": tasks})
 

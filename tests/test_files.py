@@ -15,8 +15,17 @@ import torch
 
 from kerv_cli.base import files
 from kerv_cli.base.errors import CheckpointError, StorageError
-from kerv_cli.base.files import atomic_path, read_json, sha256_of, write_bytes, write_folder, write_json
-from kerv_cli.base.leftovers import clean, is_left_over, temporary_beside
+from kerv_cli.base.files import (
+    atomic_path,
+    clean,
+    is_left_over,
+    read_json,
+    sha256_of,
+    temporary_beside,
+    write_bytes,
+    write_folder,
+    write_json,
+)
 from kerv_cli.targets.checkpoint import Description, read_description, save_module
 
 

@@ -51,7 +51,7 @@ class FastCode:
 
     def __post_init__(self) -> None:
         for token, pair in enumerate(self.merges, 2 * self.highest + 1):
-            if not all(0 <= part < token for part in pair):
+            if not 0 <= min(pair) <= max(pair) < token:
                 raise ValueError(f"the merge {pair} names a token that comes after it")
 
     @classmethod
@@ -101,7 +101,7 @@ class FastCode:
     @property
     def spellings(self) -> list[str]:
         """For each token except the end token, its text: a character per rounded coefficient."""
-        texts = [chr(FIRST + token) for token in range(2 * self.highest + 1)]
+        texts = list(map(chr, range(FIRST, FIRST + 2 * self.highest + 1)))
         for first, second in self.merges:
             texts.append(texts[first] + texts[second])
         return texts
@@ -137,7 +137,7 @@ class FastCode:
     def texts(self, coefficients: np.ndarray) -> Iterable[str]:
         """Yield a text for each row of coefficients (n, H · D): a character per coefficient, without final zeros."""
         for row in coefficients:
-            yield "".join(chr(FIRST + self.highest + int(value)) for value in np.trim_zeros(row, "b"))
+            yield "".join(map(chr, (FIRST + self.highest + np.trim_zeros(row, "b")).tolist()))
 
     def encode(self, coefficients: np.ndarray) -> np.ndarray:
         """Return the tokens (n, N) int64 of rounded coefficients (n, H · D).

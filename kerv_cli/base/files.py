@@ -1,4 +1,7 @@
-"""Write files and folders atomically (complete or not at all); read text, JSON and YAML; compute hashes."""
+"""Write files and folders atomically (complete or not at all); read text, JSON and YAML; compute hashes.
+
+A temporary name is hidden and names the machine and the process: `.<name>.<host>.<process id>-<8 digits>.tmp`.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +13,17 @@ import hashlib
 import itertools
 import json
 import os
+import re
+import secrets
 import shutil
+import socket
 import stat
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from kerv_cli.base.errors import CheckpointError, StorageError, UsageError
-from kerv_cli.base.leftovers import clean, remove, temporary_beside
 
 MOST_TEXT = 2**28
 """Maximum size of a JSON file in bytes. kerv's own files are far smaller."""
@@ -28,6 +34,13 @@ MOST_VALUES = 20_000
 MOST_BYTES = 2**36
 """Maximum size of a file of weights or of a table in bytes."""
 
+OTHER_HOSTS_STALE_HOURS = 7 * 24.0
+"""After this many hours a temporary file of another machine counts as left over by a killed process."""
+
+CLOCKS_DIFFER_SECONDS = 3600.0
+"""The clock of a network folder may be behind this machine's clock by this many seconds."""
+
+_TEMPORARY = re.compile(r"\..+\.(?P<host>[^/]+?)\.(?P<pid>\d+)-[0-9a-f]{8}\.tmp")
 _OF_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM)
 
 
@@ -56,23 +69,18 @@ def atomic_path(path: Path) -> Iterator[Path]:
     Raises:
         StorageError: The disk is full or read-only, or permission is missing.
     """
-    path = Path(path)
-    temporary: Path | None = None
+    temporary = temporary_beside(path)
     try:
         with storage_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            _clean_once(path.parent)
-            candidate = temporary_beside(path)
-            candidate.touch(exist_ok=False)
-            temporary = candidate
+            clean_once(path.parent)
+            temporary.touch(exist_ok=False)
             yield temporary
             sync(temporary)
             os.replace(temporary, path)
-            temporary = None
             sync(path.parent)
     finally:
-        if temporary is not None:
-            remove(temporary)
+        remove(temporary)
 
 
 def write_folder(folder: Path, fill: Callable[[Path], object]) -> None:
@@ -91,7 +99,7 @@ def write_folder(folder: Path, fill: Callable[[Path], object]) -> None:
     try:
         with storage_errors(folder):
             folder.parent.mkdir(parents=True, exist_ok=True)
-            _clean_once(folder.parent)
+            clean_once(folder.parent)
             temporary.mkdir()
             fill(temporary)
             for path in (*temporary.rglob("*"), temporary):
@@ -103,6 +111,22 @@ def write_folder(folder: Path, fill: Callable[[Path], object]) -> None:
             sync(folder.parent)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def set_aside(folder: Path) -> Path:
+    """Give a folder a temporary name in one step, so that every command ignores it, and return its new path.
+
+    A later command removes it if this process is killed.
+
+    Raises:
+        StorageError: The disk is full or read-only, or permission is missing.
+    """
+    temporary = temporary_beside(folder)
+    if folder.exists():
+        with storage_errors(folder):
+            folder.rename(temporary)
+            sync(folder.parent)
+    return temporary
 
 
 def _exchange(a: Path, b: Path) -> None:
@@ -122,12 +146,6 @@ def visible(folder: Path) -> list[Path]:
         return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     except OSError:
         return []
-
-
-@functools.cache
-def _clean_once(folder: Path) -> None:
-    """Remove temporary files of killed processes from a folder. Later calls of this process do nothing."""
-    clean(folder)
 
 
 def sync(path: Path) -> None:
@@ -298,3 +316,77 @@ def sha256_of(path: Path) -> str:
 def _sha256(path: str, inode: int, size: int, changed: int) -> str:
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def temporary_beside(path: Path) -> Path:
+    """Return a new temporary path in the same folder as `path`. Its name contains this machine and process."""
+    mark = f"{socket.gethostname().replace('.', '-')}.{os.getpid()}-{secrets.token_hex(4)}"
+    return path.with_name(f".{path.name[:150]}.{mark}.tmp")
+
+
+def is_left_over(path: Path) -> bool:
+    """Return whether `path` has a temporary name and the process that wrote it has ended.
+
+    A file of another machine counts as left over once it is older than OTHER_HOSTS_STALE_HOURS.
+    """
+    match = _TEMPORARY.fullmatch(path.name)
+    if match is None:
+        return False
+    try:
+        written = path.stat().st_mtime
+    except OSError:  # it was renamed or removed meanwhile
+        return False
+    if match["host"] == socket.gethostname().replace(".", "-"):
+        return not is_alive(int(match["pid"]), written + CLOCKS_DIFFER_SECONDS)
+    return time.time() - written > 3600 * OTHER_HOSTS_STALE_HOURS
+
+
+def clean(folder: Path) -> list[Path]:
+    """Remove the temporary files and folders of ended processes from `folder`, not from its subfolders.
+
+    Returns:
+        The paths that the function tried to remove. A path still exists if removing it failed.
+    """
+    paths = [path for path in folder.glob(".*.tmp") if is_left_over(path)]
+    for path in paths:
+        remove(path)
+    return sorted(paths)
+
+
+@functools.cache
+def clean_once(folder: Path) -> None:
+    """Clean a folder with `clean`. Later calls of this process do nothing."""
+    clean(folder)
+
+
+def remove(path: Path) -> None:
+    """Remove a file, or a folder with its content. If this fails, a later command tries again, without an error."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            path.unlink()
+
+
+def is_alive(pid: int, seen: float) -> bool:
+    """Return whether a process of this machine that was alive at the time `seen` is still alive.
+
+    A process that has the same id but began later does not count. Only Linux tells when a process began. On any other
+    system every process with this id counts.
+
+    Args:
+        pid: Id of the process.
+        seen: A time at which the process was alive, in seconds since 1970.
+    """
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass
+    try:
+        ticks = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19])
+        age = time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
+    except (OSError, AttributeError):
+        return True
+    return time.time() - age <= seen + 1.0  # the kernel counts in ticks of about 0.01 s

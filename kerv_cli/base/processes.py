@@ -18,15 +18,19 @@ _PR_SET_PDEATHSIG = 1
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
-def end_with(parent: int) -> None:
-    """Make this process end when its parent process ends, at most a few seconds later.
+def begin_worker(parent: int) -> None:
+    """Prepare this process as a worker. It ignores Ctrl-C, which its parent handles.
 
-    On Linux the kernel ends this process, even if it is suspended. It does so, too, when the thread that started this
-    process ends. So start workers from a thread that lives as long as they do.
+    It ends at most a few seconds after its parent. On Linux the kernel ends it, even if it is suspended. The kernel
+    does so, too, when the thread that started this process ends. So start workers from a thread that lives as long as
+    they do. Libraries that have not been imported yet compute in one thread, because the workers share the cores.
 
     Args:
         parent: Process id of the parent.
     """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for name in _THREADS:
+        os.environ.setdefault(name, "1")
     with contextlib.suppress(OSError, AttributeError):  # not Linux
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
@@ -38,24 +42,10 @@ def end_with(parent: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def begin_worker(parent: int) -> None:
-    """Prepare this process as a worker. It ends when its parent ends. It ignores Ctrl-C, which its parent handles.
-
-    Libraries that have not been imported yet compute in one thread, because the workers share the cores.
-
-    Args:
-        parent: Process id of the parent.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    for name in _THREADS:
-        os.environ.setdefault(name, "1")
-    end_with(parent)
-
-
 class Workers(ProcessPoolExecutor):
     """A pool of worker processes, each a new interpreter. A fork could deadlock in a library that has threads.
 
-    Create the pool in a thread that lives as long as the workers; see `end_with`.
+    Create the pool in a thread that lives as long as the workers; see `begin_worker`.
 
     Args:
         count: Number of processes.

@@ -20,6 +20,7 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import entry_points
+from operator import attrgetter
 from typing import Any, ClassVar, Literal, Self, TypeVar, cast
 
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
@@ -36,7 +37,9 @@ MODULES: Mapping[str, Sequence[str]] = {
     "stress": ("kerv_cli.worlds.stress.kinds",),
     "target": ("kerv_cli.targets",),
 }
-"""The modules that register kerv's own parts of a kind, in order. For all other kinds it is `kerv_cli.methods`."""
+"""The modules that register kerv's own parts of a kind, in order. For all other kinds it is METHODS."""
+
+METHODS = ("kerv_cli.methods",)
 
 METHOD_KINDS = ("prefill_draft", "proposer", "acceptance", "threshold", "rectifier", "boundary", "skip")
 """The parts of a method, in the order in which a decode uses them."""
@@ -121,7 +124,7 @@ class Part:
     @classmethod
     def every(cls) -> Mapping[str, Self]:
         """Return all registered parts of this class by name, in the order of registration."""
-        return {name: part for name, part in parts(cls.kind).items() if isinstance(part, cls)}
+        return cast(Mapping[str, Self], parts(cls.kind))
 
     @classmethod
     def find(cls, name: str, what: str = "") -> Self:
@@ -400,10 +403,8 @@ def parts(kind: str, module: str = "") -> Mapping[str, Part]:
     load_plugins()
     if kind == "drafter":
         return {name: part for name, part in parts("artifact").items() if part.settings is not NoSettings}
-    if module:
-        importlib.import_module(module)
-    else:
-        _load(kind)
+    for name in [module] if module else MODULES.get(kind, METHODS):
+        importlib.import_module(name)
     return _PARTS.get(kind, {})
 
 
@@ -415,14 +416,9 @@ def kinds() -> tuple[str, ...]:
 
 
 def _load_all() -> None:
-    for kind in (*MODULES, *METHOD_KINDS):
-        _load(kind)
-
-
-@functools.cache
-def _load(kind: str) -> None:
-    for name in MODULES.get(kind, ("kerv_cli.methods",)):
-        importlib.import_module(name)
+    for names in (*MODULES.values(), METHODS):
+        for name in names:
+            importlib.import_module(name)
 
 
 @functools.cache
@@ -434,8 +430,8 @@ def load_plugins() -> None:
     Raises:
         UsageError: A plugin cannot be imported. The message names its file and line.
     """
-    files = [name.strip() for name in os.environ.get(PLUGINS, "").split(",") if name.strip()]
-    plugins = [*(entry.value for entry in entry_points(group="kerv.parts")), *files]
+    plugins = list(map(attrgetter("value"), entry_points(group="kerv.parts")))
+    plugins += os.environ.get(PLUGINS, "").replace(",", " ").split()
     if plugins:
         _load_all()
     for name in plugins:
@@ -450,6 +446,7 @@ def _line_of(error: Exception) -> str:
     """Return where a plugin raised an error, as `FILE:LINE: `. Empty if the plugin was not found."""
     if isinstance(error, SyntaxError):
         return f"{error.filename}:{error.lineno}: "
-    frames = reversed(traceback.extract_tb(error.__traceback__)[2:])
-    own = (one for one in frames if one.filename[0] != "<" and one.filename != __file__)
-    return next((f"{one.filename}:{one.lineno}: " for one in own), "")
+    for one in reversed(traceback.extract_tb(error.__traceback__)[2:]):
+        if one.filename[0] != "<" and one.filename != __file__:
+            return f"{one.filename}:{one.lineno}: "
+    return ""

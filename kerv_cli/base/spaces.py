@@ -75,7 +75,7 @@ class ActionSpace:
             raise ValueError(f"strict {self.strict} names a DoF that is not there: {self.names}")
         if len(self.low) != self.dofs or len(self.high) != self.dofs:
             raise ValueError(f"low and high need {self.dofs} numbers each")
-        if not all(low < high < np.inf and low > -np.inf for low, high in zip(self.low, self.high, strict=True)):
+        if not np.isfinite([self.low, self.high]).all() or (np.asarray(self.low) >= self.high).any():
             raise ValueError(f"low {self.low} must lie below high {self.high}")
         if self.bins < 3 or not 0 < self.control_hz < np.inf:
             raise ValueError(f"bins {self.bins} must be at least 3, control_hz {self.control_hz} above 0")
@@ -171,7 +171,8 @@ class ActionSpace:
             of whole chunks every token is a group.
         """
         if self.code is not None:  # no token belongs to one DoF
-            yield from ((token, token + 1, False) for token in range(start, stop))
+            for token in range(start, stop):
+                yield token, token + 1, False
             return
         while start < stop:
             step, dof = divmod(start, self.dofs)
@@ -313,10 +314,6 @@ class ObservationSpace:
     extra_places: tuple[Place, ...] = ()
     extra: tuple[int, ...] = ()
     previous: tuple[int, int] | None = None
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the fields as values for JSON."""
-        return asdict(self)
 
     def without_state(self, places: tuple[Place, ...] = ()) -> ObservationSpace:
         """Return this space as the robot alone sees it: the state is the proprioception, without object positions.

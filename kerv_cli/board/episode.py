@@ -240,7 +240,7 @@ async def record(request: Request) -> Response:
     """Start to record an episode, unless it is being recorded already.
 
     The recording process is started in this function's thread, which lives as long as the board. Threads that make
-    pages end earlier, and the kernel ends a process when the thread that started it ends (`end_with`).
+    pages end earlier, and the kernel ends a process when the thread that started it ends (`begin_worker`).
     """
     found = await run_in_threadpool(_found, request)
     if found.store.kind == IMPORT:

@@ -15,15 +15,14 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from operator import itemgetter
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
 
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
-from kerv_cli.base.files import read_mapping, read_text, sha256_of, storage_errors, sync, visible
-from kerv_cli.base.leftovers import clean, temporary_beside
+from kerv_cli.base.files import clean, read_mapping, read_text, set_aside, sha256_of, visible
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.paths import shipped_dir
 from kerv_cli.base.registry import ArtifactPart
@@ -128,16 +127,18 @@ def few(names: Sequence[str], most: int = 3) -> str:
 
 def find_runs(database: Database) -> list[RunEntry]:
     """Return all entries of a database and its results folder, newest first."""
-    folder, rows = database.results / "artifacts", run_rows(database)
-    of_studies = (database.results / "studies", database.results / "rollouts")
-    for parent in (*of_studies, *map(folder.joinpath, artifact_kinds())):
-        with contextlib.suppress(OSError):
-            clean(parent)  # what killed commands left there
-    found: dict[tuple[str, str], RunEntry] = {}
-    for one in (*_studies(database), *_artifacts(folder)):
-        found[one.kind, one.folder.name] = one
+    folder = database.results / "artifacts"
+    found = {(one.kind, one.folder.name): one for one in _studies(database)}
+    for parent in (database.results / "studies", database.results / "rollouts"):
+        _clean(parent)
+    for kind in artifact_kinds():
+        _clean(folder / kind)
+        for path in visible(folder / kind):
+            # an interrupted recording and a training before its first validation have no description yet
+            if any(map(Path.is_file, (_description(path, kind), path / "recording.json", path / LOG))):
+                found[kind, path.name] = artifact_entry(path, kind)
     finished, newest = set(), {}
-    for row in reversed(rows):
+    for row in reversed(run_rows(database)):
         newest[row.kind, row.name] = row
         if row.status == COMPLETE:
             finished.add((row.kind, row.name, row.command))
@@ -149,8 +150,14 @@ def find_runs(database: Database) -> list[RunEntry]:
             entry = RunEntry(f"{kind}/{name}", kind, folder / kind / name, "", "", (kind,))
         found[kind, name] = _with_command(entry, row, (kind, name, row.command) in finished)
     labels = labels_in(database)
-    labelled = [replace(run, labels=labels.get(run.id, {})) for run in found.values()]
-    return sorted(labelled, key=lambda run: (run.started, run.id), reverse=True)
+    runs = [replace(run, labels=labels.get(run.id, {})) for run in found.values()]
+    return sorted(runs, key=attrgetter("started", "id"), reverse=True)
+
+
+def _clean(folder: Path) -> None:
+    """Remove what killed commands left in a folder, if it can be read."""
+    with contextlib.suppress(OSError):
+        clean(folder)
 
 
 def _with_command(entry: RunEntry, row: RunRow, is_finished: bool) -> RunEntry:
@@ -322,21 +329,8 @@ def _description(folder: Path, kind: str) -> Path:
     return folder / (own or f"{kind}.json")
 
 
-def _artifacts(folder: Path) -> Iterator[RunEntry]:
-    """Yield an entry for each artifact in a folder that has a folder for each kind."""
-    for kind in artifact_kinds():
-        for path in visible(folder / kind):
-            # an interrupted recording and a training before its first validation have no description yet
-            if any(map(Path.is_file, (_description(path, kind), path / "recording.json", path / LOG))):
-                yield _artifact(path, kind)
-
-
-def state_of(folder: Path, kind: str) -> str:
-    """Return the state of the artifact in a folder, such as `complete` or `step 300 of 600` (see `RunEntry`)."""
-    return _artifact(folder, kind).state
-
-
-def _artifact(folder: Path, kind: str) -> RunEntry:
+def artifact_entry(folder: Path, kind: str) -> RunEntry:
+    """Return the entry of an artifact in a folder. Its state is `damaged` if its files cannot be read."""
     changed = [path.stat().st_mtime for path in visible(folder) if path.is_file()]
     started = datetime.fromtimestamp(max(changed, default=0.0), UTC).isoformat(timespec="milliseconds")[:23]
     run = RunEntry(f"{kind}/{folder.name}", kind, folder, started, "damaged")
@@ -422,7 +416,7 @@ def labels_in(database: Database) -> dict[str, dict[str, str]]:
 
 def set_labels(database: Database, run: str, labels: Mapping[str, str]) -> None:
     """Replace the labels of a run, given its id. Empty labels are removed."""
-    kept = dict(filter(itemgetter(1), labels.items()))
+    kept = {kind: text for kind, text in labels.items() if text}
     with database.writing() as connection:
         connection.execute(sa.delete(ABOUT).where(ABOUT.c.key == _ABOUT + run))
         if kept:
@@ -455,11 +449,7 @@ def remove(run: RunEntry, database: Database) -> None:
     Raises:
         StorageError: The disk is full or not writable.
     """
-    gone = temporary_beside(run.folder)
-    if run.folder.exists():
-        with storage_errors(run.folder):
-            run.folder.rename(gone)
-            sync(run.folder.parent)
+    gone = set_aside(run.folder)
     if run.has_episodes:
         store_of(run, database).remove()
     set_labels(database, run.id, {})

@@ -170,7 +170,10 @@ def read_evaluations(path: Path) -> list[Evaluation]:
     evaluations: list[Evaluation] = []
     for file in files:
         try:
-            evaluations += filter(attrgetter("episodes"), _read_recording(file))
+            with contextlib.closing(connect_foreign(file)) as recording:
+                for name, metadata in recording.execute("SELECT eval_id, metadata FROM eval_metadata").fetchall():
+                    evaluation = _evaluation(recording, file, name, metadata)
+                    evaluations += [evaluation] if evaluation.episodes else []
         except _DAMAGE as error:
             why = " ".join(f"{type(error).__name__} {error}".split())[:120]
             raise CheckpointError(f"{file} is damaged, cut short or no recording of vla-eval ({why})") from error
@@ -180,13 +183,6 @@ def read_evaluations(path: Path) -> list[Evaluation]:
     if len(benchmarks) < len(evaluations) or any(one.server != evaluations[0].server for one in evaluations):
         raise UsageError(f"{path} holds several evaluations of a benchmark, or of several servers: name each file")
     return evaluations
-
-
-def _read_recording(path: Path) -> Iterator[Evaluation]:
-    """Read the evaluations in a vla-eval recording."""
-    with contextlib.closing(connect_foreign(path)) as file:
-        for name, metadata in file.execute("SELECT eval_id, metadata FROM eval_metadata"):
-            yield _evaluation(file, path, name, metadata)
 
 
 def _evaluation(file: sqlite3.Connection, path: Path, name: str, metadata: str) -> Evaluation:

@@ -23,7 +23,7 @@ import sqlalchemy as sa
 
 from kerv_cli.base.durations import about, left
 from kerv_cli.base.errors import CheckpointError, Interrupted, KervError, StorageError, UsageError
-from kerv_cli.base.leftovers import is_alive
+from kerv_cli.base.files import is_alive
 from kerv_cli.lab.command import current_command
 from kerv_cli.lab.database import EPISODES, RUNS, STUDIES, Database, now
 from kerv_cli.targets.provenance import git_commit

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -264,7 +264,7 @@ def target_fields(
     **others: Any,
 ) -> dict[str, Any]:
     """Return the description of a target for `save_module`. The arguments are fields of `TargetDescription`."""
-    spaces = {"actions": actions.as_dict(), "observation": observation.as_dict()}
+    spaces = {"actions": actions.as_dict(), "observation": asdict(observation)}
     empty: dict[str, Any] = {"cameras": [], "words": [], "provenance": {}}
     return {"family": family, "environment": environment, "settings": dict(settings), **spaces, **empty, **others}
 

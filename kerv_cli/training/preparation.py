@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.registry import ArtifactPart
-from kerv_cli.catalogue.entries import state_of
+from kerv_cli.catalogue.entries import artifact_entry
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database
@@ -135,7 +135,7 @@ def _state(artifacts: Artifacts, database: Database, kind: str, kinds: Sequence[
         return "of other artifacts"
     if not files.is_complete(described, kinds):
         return MISSING
-    state = state_of(path, kind) if isinstance(files, TrainableDrafter) else THERE
+    state = artifact_entry(path, kind).state if isinstance(files, TrainableDrafter) else THERE
     if state == "complete" and command_to_go_on(database, kind, path):
         return "unfinished"  # e.g. the disk was full before the last files were written
     return THERE if state == "complete" else state

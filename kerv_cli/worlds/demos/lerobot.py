@@ -13,7 +13,7 @@ import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -304,7 +304,7 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
     manifest = {
         **recording,
         "actions": space.as_dict(),
-        "observation": observation.as_dict(),
+        "observation": asdict(observation),
         "versions": {"lerobot": str(source.info["codebase_version"])},
         **totals(entries, {}, missing=0),
         "instructions": instructions,

@@ -246,7 +246,7 @@ def _identity(config: DemoConfig) -> dict[str, Any]:
         "format": FORMAT,
         "environment": spec.name,
         "actions": spec.actions.as_dict(),
-        "observation": spec.observation.as_dict(),
+        "observation": asdict(spec.observation),
         "config": settings,
         "versions": {name: version(name) for name in (*spec.packages, "numpy")} | {"python": platform.python_version()},
     }
