@@ -27,13 +27,13 @@ from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.runner import Runner, close_worlds
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.worlds import spec_of
+from kerv_cli.worlds import stress as stressing
 from kerv_cli.worlds.demos.dataset import register_recorded
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
 from kerv_cli.worlds.mujoco_world import MujocoWorld
 from kerv_cli.worlds.settings import CameraSettings, StressSettings
-from kerv_cli.worlds.stress import base as stressing
-from kerv_cli.worlds.stress.kinds import CameraJitter, Objects, Sensor, objects, scenery_of
+from kerv_cli.worlds.stress import CameraJitter, Objects, Sensor, objects, scenery_of
 from kerv_cli.worlds.vectors import length
 
 SEED, STEPS, SIZE = 50_006, 24, 48

@@ -21,7 +21,7 @@ from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.metaworld.world import MetaWorld
 from kerv_cli.worlds.settings import CameraSettings
-from kerv_cli.worlds.stress.base import NO_STRESS, Stress
+from kerv_cli.worlds.stress import NO_STRESS, Stress
 from kerv_cli.worlds.views import View, frame_shape, views_of
 
 SIZE = 32

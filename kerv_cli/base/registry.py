@@ -34,7 +34,7 @@ _COMMANDS = (
 MODULES: Mapping[str, Sequence[str]] = {
     "command": tuple(f"kerv_cli.cli.{name}" for name in _COMMANDS.split()),
     "environment": ("kerv_cli.worlds",),
-    "stress": ("kerv_cli.worlds.stress.kinds",),
+    "stress": ("kerv_cli.worlds.stress",),
     "target": ("kerv_cli.targets",),
 }
 """The modules that register kerv's own parts of a kind, in order. For all other kinds it is METHODS."""

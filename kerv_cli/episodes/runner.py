@@ -30,8 +30,8 @@ from kerv_cli.methods.unverified import native_decoder
 from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.settings import CameraSettings, WorldSettings
 from kerv_cli.worlds.spec import World
-from kerv_cli.worlds.stress.base import NO_STRESS, Stress
-from kerv_cli.worlds.stress.base import build as build_stress
+from kerv_cli.worlds.stress import NO_STRESS, Stress
+from kerv_cli.worlds.stress import build as build_stress
 
 K = TypeVar("K")
 OpenWorld = Callable[[str], World]

@@ -17,6 +17,22 @@ if TYPE_CHECKING:
     from kerv_cli.worlds.settings import WorldSettings
     from kerv_cli.worlds.spec import EnvironmentSpec
 
+
+@dataclass(frozen=True)
+class Task:
+    """One manipulation task.
+
+    Attributes:
+        name: Full name. No other environment has a task with this name.
+        instruction: Sentence that the policy reads.
+        difficulty: Name of a group of tasks. Tables also show averages over these groups.
+    """
+
+    name: str
+    instruction: str
+    difficulty: str
+
+
 W = TypeVar("W", bound="WorldSettings")
 
 

@@ -21,7 +21,7 @@ from kerv_cli.base.errors import RenderingUnavailable
 from kerv_cli.base.spaces import Observation
 from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import EnvironmentSpec, World
-from kerv_cli.worlds.stress.base import Model, ModelChanges
+from kerv_cli.worlds.stress import Model, ModelChanges
 
 if TYPE_CHECKING:
     import mujoco

@@ -19,9 +19,9 @@ from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.limits import check_settings
 from kerv_cli.base.registry import load
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
+from kerv_cli.worlds import Task
 from kerv_cli.worlds.settings import CameraSettings, StressSettings
-from kerv_cli.worlds.stress.base import NO_STRESS, Stress, StressPart
-from kerv_cli.worlds.task import Task
+from kerv_cli.worlds.stress import NO_STRESS, Stress, StressPart
 from kerv_cli.worlds.views import views_of
 
 Expert: TypeAlias = Callable[[Observation], NDArray[np.float64]]

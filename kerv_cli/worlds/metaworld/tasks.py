@@ -11,7 +11,7 @@ import csv
 from collections.abc import Mapping
 from pathlib import Path
 
-from kerv_cli.worlds.task import Task
+from kerv_cli.worlds import Task
 
 SUFFIX = "-v3"
 

@@ -9,9 +9,8 @@ importable.
 from __future__ import annotations
 
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, Place
-from kerv_cli.worlds import EnvironmentPart
+from kerv_cli.worlds import EnvironmentPart, Task
 from kerv_cli.worlds.spec import EnvironmentSpec
-from kerv_cli.worlds.task import Task
 
 SPEC = EnvironmentSpec(
     name="insertion",
