@@ -16,8 +16,7 @@ from flips import flipped
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.bench import measure as measuring
-from kerv_cli.bench.machine import measure_machine
-from kerv_cli.bench.measure import Laps, Phase, card_of, costs_of, decoders, measure, profile_of
+from kerv_cli.bench.measure import Laps, Phase, card_of, costs_of, decoders, measure, measure_machine, profile_of
 from kerv_cli.bench.model import layer_weights, open_model
 from kerv_cli.bench.physics import Sizes
 from kerv_cli.bench.settings import BenchSettings
@@ -218,8 +217,8 @@ def test_the_cost_model_adds_the_forwards_up():
 @pytest.fixture
 def quick(monkeypatch):
     """Small buffers, and no shipped policy beside the measured one."""
-    monkeypatch.setattr("kerv_cli.bench.machine._BUFFER", 2**20)
-    monkeypatch.setattr("kerv_cli.bench.machine._WIDTH", 256)
+    monkeypatch.setattr("kerv_cli.bench.measure._BUFFER", 2**20)
+    monkeypatch.setattr("kerv_cli.bench.measure._WIDTH", 256)
     monkeypatch.setattr(measuring, "_EVICTING", 2**10)
     monkeypatch.setattr(measuring, "source_decoders", lambda settings: {})
 

@@ -24,8 +24,8 @@ from kerv_cli.report.viewing import save_recording
 from kerv_cli.report.viewing.token_outcomes import summary
 from kerv_cli.worlds import EnvironmentPart
 from kerv_cli.worlds.demos.recording import DemoConfig, _identity
-from kerv_cli.worlds.metaworld.experts import VERSION, HandlePullSide
 from kerv_cli.worlds.metaworld.spec import SPEC
+from kerv_cli.worlds.metaworld.world import VERSION, HandlePullSide
 from kerv_cli.worlds.settings import EVALUATION_SEED, CameraSettings
 from kerv_cli.worlds.spec import World
 

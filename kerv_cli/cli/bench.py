@@ -33,8 +33,7 @@ def bench(settings: BenchSettings, as_json: AsJson = False) -> None:
     if settings.projected != "none":
         _project(settings, as_json)
         return
-    from kerv_cli.bench.machine import measure_machine
-    from kerv_cli.bench.measure import card_of, measure
+    from kerv_cli.bench.measure import card_of, measure, measure_machine
     from kerv_cli.bench.model import open_model
     from kerv_cli.bench.tables import card_rows, phase_rows
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, Place
-from kerv_cli.worlds.metaworld.experts import OURS, VERSION
 from kerv_cli.worlds.metaworld.tasks import SUFFIX, SUITES, TASKS
+from kerv_cli.worlds.metaworld.world import OURS, VERSION
 from kerv_cli.worlds.spec import EnvironmentSpec
 
 _STEP = 18  # numbers of a time step: hand xyz, gripper opening, then position and rotation of two objects
