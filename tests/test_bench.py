@@ -17,12 +17,13 @@ from flips import flipped
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.bench import measure as measuring
 from kerv_cli.bench.measure import Laps, Phase, card_of, costs_of, decoders, measure, measure_machine, profile_of
-from kerv_cli.bench.model import layer_weights, open_model
+from kerv_cli.bench.model import open_model
 from kerv_cli.bench.physics import Sizes
 from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.cost import READ_PHASES, Profile, Work, prices, read_profile, work_of, work_of_record
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.eagle.drafter import DrafterProposer
+from kerv_cli.targets.openvla.config import Language
 
 pytestmark = pytest.mark.usefixtures("quick_report")
 
@@ -97,7 +98,6 @@ def test_bytes_and_operations_of_a_forward():
     s, sizes = model.target.settings, model.sizes
     weights = s.layers * (4 * s.width**2 + 3 * s.width * s.feed_forward) + s.width * 255
     assert sizes.trunk_weights == weights
-    assert layer_weights(s) * s.layers + s.width * 255 == weights
     read, flops = sizes.forward(3, 10)
     assert 2 <= sizes.weight < 2.1  # half precision, and float32 for the gains of the norms
     assert read == sizes.weight * weights + 2 * s.layers * 13 * s.width * 4
@@ -119,7 +119,7 @@ def test_the_sizes_of_a_grown_target_are_those_of_its_new_layers(policies, tmp_p
     assert (sizes.cached, sizes.channels) == (2 * 3 * 128, 3 * 128)
     prompt = model.target.max_prompt
     assert sizes.forward(prompt, 0)[1] == 2 * sizes.trunk_weights * 70 + 4 * 3 * 128 * 70 * 71 / 2
-    assert base.sizes == Sizes.of(s.width, s.layers, s.feed_forward, tokens, 4.0, 4)
+    assert base.sizes == Sizes.of(Language(tokens, s.width, s.feed_forward, s.layers, 1), 4)
 
 
 @pytest.mark.usefixtures("quick")

@@ -197,9 +197,7 @@ def test_weights_alone_give_about_what_the_model_itself_gives():
 @pytest.mark.parametrize("weights", [4.6e6, 135e6, 450e6, 3e9, 7e9, 70e9])
 def test_an_assumed_shape_has_the_weights_that_were_asked_for(weights):
     language = language_of(weights)
-    sizes = Sizes.of(
-        language.hidden_size, language.num_hidden_layers, language.intermediate_size, language.vocab_size, 2, 2
-    )
+    sizes = Sizes.of(language, 2)
     assert sizes.trunk_weights == pytest.approx(weights, rel=0.02)
 
 

@@ -15,7 +15,7 @@ from kerv_cli.worlds import spec as spec_module
 from kerv_cli.worlds.conformance import check_environment
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record
-from kerv_cli.worlds.libero import packages
+from kerv_cli.worlds.libero import world as packages
 from kerv_cli.worlds.libero.spec import SPEC, STATES
 from kerv_cli.worlds.settings import CameraSettings
 

@@ -11,7 +11,6 @@ import functools
 import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from kerv_cli.base.files import read_json
@@ -69,11 +68,6 @@ class Means(NamedTuple):
     def plus(self, other: Means) -> Means:
         """Return the sums of these means and `other`: the means of two parts of a decode that follow one another."""
         return Means(*map(operator.add, self, other))
-
-    @property
-    def accepted_each(self) -> float:
-        """Accepted draft tokens per verification. 0 if no draft was verified."""
-        return self.accepted / self.verifications if self.verifications else 0.0
 
 
 @dataclass(frozen=True)
@@ -253,8 +247,11 @@ def recorded(table: str) -> list[Recorded]:
     if not (folder / f"{table}.json").is_file():
         return []
     settings = read_json(folder / f"{table}.json")["labels"]
-    rows = _rows(folder / f"{table}.csv")
-    found = []
+    found, rows = [], {}
+    with (folder / f"{table}.csv").open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            if row["averaging"].startswith("micro"):  # over all tasks
+                rows[row["label"]] = row
     for label, row in rows.items():
         chosen = settings[label]["settings"]
         if chosen["skip"]["kind"] == "parallel":
@@ -266,12 +263,6 @@ def recorded(table: str) -> list[Recorded]:
             forwards = TABLES[table] * per_step / of_ar / verified
         found.append(Recorded(table, label, chosen["method"], TABLES[table], drafts, forwards, float(row["speedup"])))
     return found
-
-
-def _rows(path: Path) -> dict[str, dict[str, str]]:
-    """Return the rows over all tasks, by the setting's label."""
-    with path.open(encoding="utf-8", newline="") as file:
-        return {row["label"]: row for row in csv.DictReader(file) if row["averaging"].startswith("micro")}
 
 
 def _drafts(settings: Mapping[str, Any], skipped: float, retrieved: float) -> Drafts:

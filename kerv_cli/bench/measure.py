@@ -11,7 +11,7 @@ import copy
 import functools
 import itertools
 import logging
-import time
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -49,7 +49,7 @@ _LOG = logging.getLogger("kerv")
 _BUFFER = 64 * 2**20  # float32 numbers, 256 MiB: larger than the caches of a server, which hold 100 MB and more
 _LEVELS = (2**20, 4 * 2**20, 16 * 2**20, 32 * 2**20)  # bytes of the buffers that measure the bandwidth of CPU caches
 _ROWS, _WIDTH = 256, 4096  # of the matrix multiplication that measures operations per second
-REPEATS = 7
+REPEATS = 9
 _WARM_UP = 2  # repeats that do not count
 _EVICTING = 16 * 2**20  # float32 numbers that are read before each decode, to empty the caches as a simulator does
 _TREE = (5, 8, 50)  # depth, children, nodes of EAGLE-2's tree
@@ -68,12 +68,12 @@ class Machine:
     Attributes:
         bandwidth: Bytes per second when reading a buffer that is larger than all caches.
         flops: Operations per second of a large matrix multiplication in the number format of the weights.
-        caches: (bytes, bandwidth) of smaller buffers that fit into caches, the smallest first. Empty on a GPU.
+        caches: Bytes per second of smaller buffers that fit into caches, in the order of `_LEVELS`. Empty on a GPU.
     """
 
     bandwidth: float
     flops: float
-    caches: tuple[tuple[float, float], ...] = ()
+    caches: tuple[float, ...] = ()
 
     def bandwidth_of(self, read: float) -> float:
         """Return the bytes per second at which the same `read` bytes can be read again and again.
@@ -81,7 +81,10 @@ class Machine:
         This is the bandwidth of the smallest measured buffer that holds the bytes. If no buffer is that large, it is
         `bandwidth`.
         """
-        return next((rate for size, rate in self.caches if read <= size), self.bandwidth)
+        for size, bandwidth in zip(_LEVELS, self.caches, strict=False):
+            if read <= size:
+                return bandwidth
+        return self.bandwidth
 
     def bounds(self, read: float, flops: float) -> tuple[float, float]:
         """Return the shortest possible seconds for reading `read` bytes, and for `flops` operations."""
@@ -89,27 +92,17 @@ class Machine:
 
     def best_of(self, other: Machine) -> Machine:
         """Return the higher value of two measurements in each field. Other programs can only make a value lower."""
-        caches = [(size, max(a, b)) for (size, a), (_, b) in zip(self.caches, other.caches, strict=True)]
-        return Machine(max(self.bandwidth, other.bandwidth), max(self.flops, other.flops), tuple(caches))
+        caches = tuple(map(max, self.caches, other.caches))
+        return Machine(max(self.bandwidth, other.bandwidth), max(self.flops, other.flops), caches)
 
 
-def synchronise(device: torch.device) -> None:
-    """Wait until a GPU has finished its work. Does nothing on a CPU."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-
-
-def timed(work: Callable[[], object], device: torch.device, repeats: int) -> np.ndarray:
-    """Run a function `repeats` times after two warm-up runs, and return the seconds (repeats,) of each run."""
-    for _ in range(2):
+def fastest(work: Callable[[], object], device: torch.device) -> float:
+    """Run a function a few times, and return the seconds of the fastest run."""
+    seconds = math.inf
+    for _ in range(REPEATS):
+        clock = Stopwatch(device)
         work()
-    seconds = np.empty(repeats)
-    for i in range(repeats):
-        synchronise(device)
-        begin = time.perf_counter()
-        work()
-        synchronise(device)
-        seconds[i] = time.perf_counter() - begin
+        seconds = min(seconds, clock.stop())
     return seconds
 
 
@@ -123,18 +116,17 @@ def measure_machine(device: torch.device, dtype: torch.dtype) -> Machine:
     """
 
     def rate(numbers: int) -> float:
-        return 4.0 * numbers / float(timed(buffer[:numbers].sum, device, REPEATS).min())
+        return 4.0 * numbers / fastest(buffer[:numbers].sum, device)
 
     on_cpu = device.type == "cpu"
     buffer, width = torch.ones(_BUFFER, device=device), _WIDTH // 4 if on_cpu else _WIDTH
-    bandwidth, caches = rate(_BUFFER), [(size, rate(size // 4)) for size in _LEVELS if on_cpu]
+    bandwidth, caches = rate(_BUFFER), [rate(size // 4) for size in _LEVELS if on_cpu]
     x = torch.ones(_ROWS, width, dtype=dtype, device=device)
     weight = torch.ones(width, width, dtype=dtype, device=device)
     multiply: Callable[..., object] = functools.partial(F.linear, weight=weight)
     if on_cpu and dtype == torch.float32:  # as in a target's forward
         multiply = Program(multiply, (1, width))
-    best = timed(lambda: multiply(x), device, REPEATS).min()
-    return Machine(bandwidth, 2.0 * _ROWS * width**2 / float(best), tuple(caches))
+    return Machine(bandwidth, 2.0 * _ROWS * width**2 / fastest(lambda: multiply(x), device), tuple(caches))
 
 
 @dataclass(frozen=True)
@@ -365,12 +357,6 @@ def card_of(model: Model, machine: Machine) -> dict[str, Any]:
         makes a table of it.
     """
     prompt, tokens, sizes = model.target.max_prompt, model.size, model.sizes
-    needs = {
-        "one token": sizes.forward(1, prompt),
-        f"verification of {tokens}": sizes.forward(tokens, prompt),
-        "prefill": sizes.forward(prompt, 0),
-        f"prefill and {tokens - 1} drafted": sizes.forward(prompt + tokens - 1, 0),
-    }
     weights = sizes.trunk_weights * sizes.weight
     return {
         "weights": sizes.trunk_weights,
@@ -381,7 +367,12 @@ def card_of(model: Model, machine: Machine) -> dict[str, Any]:
         "bandwidth": machine.bandwidth,
         "bandwidth_of_weights": machine.bandwidth_of(weights),
         "flops": machine.flops,
-        "floors": {name: machine.bounds(*need) for name, need in needs.items()},
+        "floors": {
+            "one token": machine.bounds(*sizes.forward(1, prompt)),
+            f"verification of {tokens}": machine.bounds(*sizes.forward(tokens, prompt)),
+            "prefill": machine.bounds(*sizes.forward(prompt, 0)),
+            f"prefill and {tokens - 1} drafted": machine.bounds(*sizes.forward(prompt + tokens - 1, 0)),
+        },
     }
 
 

@@ -107,11 +107,6 @@ def random_target(shape: TargetSettings, device: torch.device, dtype: torch.dtyp
     return target
 
 
-def layer_weights(settings: TargetSettings) -> int:
-    """Return the number of weights in one decoder layer's matrices."""
-    return 4 * settings.width**2 + 3 * settings.width * settings.feed_forward
-
-
 def open_model(settings: BenchSettings) -> Model:
     """Open `settings.target` for inference: a policy, or a shape of conf/target, which gets random weights.
 
@@ -145,12 +140,14 @@ def open_model(settings: BenchSettings) -> Model:
 
 
 def _shape(settings: BenchSettings) -> Model:
-    shape = shape_of(settings.target, settings.tokens)
+    shape = compose("train_target", [f"target={settings.target}"], TrainTargetSettings).target
+    shape = replace(shape, chunk=-(-settings.tokens // SPEC.actions.dofs))
     device = torch.device(set_up(settings.runtime)[0])
     on_cpu = device.type == "cpu"
     dtype = DTYPES[{"auto": "float32" if on_cpu else "bfloat16"}.get(settings.dtype, settings.dtype)]
     size = dtype.itemsize + _COMPILED * on_cpu
-    needed, most = _SPARE * size * layer_weights(shape) * (shape.layers + 1), memory_of(device)
+    layer = 4 * shape.width**2 + 3 * shape.width * shape.feed_forward
+    needed, most = _SPARE * size * layer * (shape.layers + 1), memory_of(device)
     if needed > most:
         raise UsageError(
             f"target={settings.target} needs {needed / 1e9:.1f} GB in {str(dtype).removeprefix('torch.')}, "
@@ -159,12 +156,6 @@ def _shape(settings: BenchSettings) -> Model:
     with torch.inference_mode():
         target = random_target(shape, device, dtype)
         return Model(settings.target, target, _drafter(target), blank(target), True)
-
-
-def shape_of(name: str, tokens: int) -> TargetSettings:
-    """Return a shape of conf/target, with chunks of at least `tokens` tokens."""
-    shape = compose("train_target", [f"target={name}"], TrainTargetSettings).target
-    return replace(shape, chunk=-(-tokens // SPEC.actions.dofs))
 
 
 def _drafter(target: ReadableTarget) -> EagleNetwork:

@@ -179,30 +179,18 @@ class Sizes:
     drafter_padding: int = 0
 
     @classmethod
-    def of(
-        cls,
-        width: int,
-        layers: int,
-        feed_forward: int,
-        vocabulary: int,
-        weight: float,
-        slot: float,
-        shared: float = 1.0,
-    ) -> Sizes:
+    def of(cls, language: Language, number: float) -> Sizes:
         """Return the sizes of a Llama-style target and of its drafter, which has one layer of the same shape.
 
         Args:
-            width: Width of the hidden states.
-            layers: Number of layers.
-            feed_forward: Hidden units of a layer's feed-forward part.
-            vocabulary: Number of tokens that the head knows.
-            weight: Bytes of a weight.
-            slot: Bytes of a number in the key/value cache.
-            shared: Heads of keys and values ÷ heads of queries.
+            language: Shape of the target's layers and its vocabulary.
+            number: Bytes of a weight, and of a number in the key/value cache.
         """
-        keys, head, channels = round(shared * width), width * vocabulary, layers * width
-        layer = 2 * width**2 + 2 * width * keys + 3 * width * feed_forward
-        return cls(layers * layer, head, layer + 2 * width**2 + head, channels, 2 * layers * keys, weight, slot)
+        width, layers = language.hidden_size, language.num_hidden_layers
+        keys = round(width * language.key_value_heads / language.num_attention_heads)
+        layer = 2 * width**2 + 2 * width * keys + 3 * width * language.intermediate_size
+        head, channels, cached = width * language.vocab_size, layers * width, 2 * layers * keys
+        return cls(layers * layer, head, layer + 2 * width**2 + head, channels, cached, number, number)
 
     @property
     def trunk_weights(self) -> int:
@@ -297,11 +285,6 @@ def priced(shape: Shape, device: Device, engine: Engine) -> Profile:
     return Profile(shape.prompt, phases, CHUNK, {"target": shape.name, "device_name": device.title})
 
 
-def _block(tower: Tower) -> int:
-    """Return the number of weights in the matrices of a block of a vision tower."""
-    return 4 * tower.width**2 + 2 * tower.width * tower.feed_forward
-
-
 def encoder_of(towers: Sequence[Tower], width: int) -> Needs:
     """Return what OpenVLA's encoder needs: all blocks but the last of each tower, and the projector of three layers.
 
@@ -309,14 +292,15 @@ def encoder_of(towers: Sequence[Tower], width: int) -> Needs:
         towers: Shapes of the encoder's vision transformers.
         width: Width of the language model.
     """
-    weights, flops, blocks = 0.0, 0.0, 0
+    weights, flops, blocks, channels = 0.0, 0.0, 0, 0
     for tower in towers:
         tokens, depth = tower.patches + tower.prefix, tower.depth - 1
-        patch = 3 * tower.patch**2 * tower.width
-        weights += depth * _block(tower) + patch
-        flops += 2.0 * tokens * (depth * _block(tower) + patch) + 4.0 * depth * tower.width * tokens**2
+        block = 4 * tower.width**2 + 2 * tower.width * tower.feed_forward  # weights in its matrices
+        read = depth * block + 3 * tower.patch**2 * tower.width
+        weights += read
+        flops += 2.0 * tokens * read + 4.0 * depth * tower.width * tokens**2
         blocks += depth
-    channels = sum(tower.width for tower in towers)
+        channels += tower.width
     projector = channels * 4 * channels + 4 * channels * width + width**2
     flops += 2.0 * projector * towers[0].patches
     return Needs(_HALF * (weights + projector), flops, blocks=blocks, kernels=_ENCODER, asks=True)
@@ -342,9 +326,7 @@ def vla_shape(name: str, language: Language, prompt: int, encoder: Needs) -> Sha
         prompt: P, number of prompt tokens.
         encoder: What its vision encoder needs.
     """
-    width, layers = language.hidden_size, language.num_hidden_layers
-    shared = language.key_value_heads / language.num_attention_heads
-    sizes = Sizes.of(width, layers, language.intermediate_size, language.vocab_size, _HALF, _HALF, shared)
+    width, sizes = language.hidden_size, Sizes.of(language, _HALF)
     # The early drafter reads two pooled vectors, has two blocks of 384 units and spreads 32 features over 7 tokens. Its
     # kernels and the scout's are counted in the shipped drafters, the scout's other figures, too. A datastore has the
     # shipped one's 45,221 keys of 32 numbers.
@@ -355,7 +337,7 @@ def vla_shape(name: str, language: Language, prompt: int, encoder: Needs) -> Sha
         "scout": Needs(_HALF * 1.253e6, 30.2e6, kernels=121),
         "retrieval": Needs(_HALF * 45_221 * 32, 2.0 * 45_221 * 32, kernels=10),
     }
-    return Shape(name, sizes, layers, prompt, parts)
+    return Shape(name, sizes, language.num_hidden_layers, prompt, parts)
 
 
 def openvla(name: str, language: Language, towers: Sequence[Tower]) -> Shape:

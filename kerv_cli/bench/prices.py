@@ -6,7 +6,7 @@ autoregressive decoding.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -62,7 +62,8 @@ FAMILIES = (
     Family("unverified, own encoder", "scout_unverified", Drafts(source="scout", skipped=1.0, encodes=False)),
 )
 """Families of methods. The published length is Spec-VLA's, as HeiSD quotes it (docs/methods.md §2.3)."""
-_PUBLISHED_TOKENS = 7
+ACTION = 7
+"""Number of tokens of one action of OpenVLA. Published lengths and times are for chunks of one action."""
 
 
 def computed(policy: Described, device: Device) -> list[NamedProfile]:
@@ -101,21 +102,27 @@ class Answer:
     """The speed of a family of methods with an engine. Every speed is against AR: 2.0 means twice as fast.
 
     Attributes:
-        family: The family.
+        family: Name of the family.
+        method: Method that represents it.
         ceiling: Speed if every draft token is accepted, and every decode that may skip verification does.
-        published: Speed at the acceptance that the paper reports. None: the paper reports no acceptance.
-        own: Speed at the acceptance that kerv measured. None: the published table of kerv does not have this family.
-        recorded: The setting of that table with which the acceptance of `own` was measured. None if `own` is None.
-        break_even: Accepted draft tokens per verification at which the family is as fast as AR. None: the family is
-            always slower, or it skips verification.
+        at_published_acceptance: Speed at the acceptance that the paper reports. None: it reports none.
+        paper_reports: Speed that the paper reports for its own machine. None: it reports none.
+        at_own_acceptance: Speed at the acceptance that kerv measured. None: kerv's published table lacks this family.
+        own_acceptance_from: The table and its setting with which that acceptance was measured.
+        break_even_tokens: Accepted draft tokens per verification at which the family is as fast as AR. None: the family
+            is always slower, or it skips verification.
+        is_verified: Whether the family never skips verification.
     """
 
-    family: Family
+    family: str
+    method: str
     ceiling: float
-    published: float | None
-    own: float | None
-    recorded: Recorded | None
-    break_even: float | None
+    at_published_acceptance: float | None
+    paper_reports: str | None
+    at_own_acceptance: float | None
+    own_acceptance_from: str | None
+    break_even_tokens: float | None
+    is_verified: bool
 
 
 @dataclass(frozen=True)
@@ -138,14 +145,14 @@ class Estimate:
     @cached_property
     def parts(self) -> dict[str, tuple[float, str]]:
         """By name of each part of an autoregressive decode: its seconds, and what takes most of them."""
-        profile, bounds = self.costs.profile, self.costs.bounds
-        rest = self.tokens - 1
-        seconds = {
-            "vision encoder": ("encode", profile.seconds("encode", 1)),
-            f"prefill, {profile.prompt} tokens": ("prefill", profile.seconds("prefill", profile.prompt)),
-            f"{rest} further token{'s' * (rest != 1)}": ("verify", rest * profile.seconds("verify", 1)),
-        }
-        return {name: (taken, bounds.get(kind, "measured")) for name, (kind, taken) in seconds.items()}
+        profile, rest, parts = self.costs.profile, self.tokens - 1, {}
+        for name, kind, seconds in (
+            ("vision encoder", "encode", profile.seconds("encode", 1)),
+            (f"prefill, {profile.prompt} tokens", "prefill", profile.seconds("prefill", profile.prompt)),
+            (f"{rest} further token{'s' * (rest != 1)}", "verify", rest * profile.seconds("verify", 1)),
+        ):
+            parts[name] = seconds, self.costs.bounds.get(kind, "measured")
+        return parts
 
     @property
     def encoder(self) -> float:
@@ -155,26 +162,24 @@ class Estimate:
     @cached_property
     def answers(self) -> list[Answer]:
         """The speeds of all families of methods that the profile can price."""
-        table, answers = recorded(nearest_table(self.tokens)), []
+        profile, table, answers = self.costs.profile, recorded(nearest_table(self.tokens)), []
         for family in FAMILIES:
-            needed = [family.drafts.source] if family.drafts.source else ["feed", "draft"]
-            if not self.costs.profile.lacks(needed):
-                answers.append(self._answer(family, table))
+            drafts, published, own, source, even = family.drafts, None, None, None, None
+            if profile.lacks([drafts.source] if drafts.source else ["feed", "draft"]):
+                continue
+            best = Decodes(profile, self.tokens, drafts)
+            if family.length is not None:
+                paper = Decodes(profile, ACTION, drafts)
+                published = best.speed([paper.acceptance_for(1 + (ACTION - 1) / family.length)])
+            if (shown := closest(table, family)) is not None:
+                chance = Decodes(profile, shown.tokens, shown.drafts).acceptance_for(shown.forwards)
+                own = Decodes(profile, self.tokens, shown.drafts).speed([chance])
+                source = f"results/tables/{shown.table}.csv, {shown.label}"
+            if not drafts.skipped and (means := best.break_even()) is not None:
+                even = means.accepted / means.verifications if means.verifications else 0.0
+            speeds = best.speed([1.0]), published, family.reported or None, own, source, even
+            answers.append(Answer(family.name, family.method, *speeds, not drafts.skipped))
         return answers
-
-    def _answer(self, family: Family, table: Sequence[Recorded]) -> Answer:
-        profile, best = self.costs.profile, Decodes(self.costs.profile, self.tokens, family.drafts)
-        published, own = None, None
-        if family.length is not None:
-            paper = Decodes(profile, _PUBLISHED_TOKENS, family.drafts)
-            chance = paper.acceptance_for(1 + (_PUBLISHED_TOKENS - 1) / family.length)
-            published = best.speed([chance])
-        shown = closest(table, family)
-        if shown is not None:
-            chance = Decodes(profile, shown.tokens, shown.drafts).acceptance_for(shown.forwards)
-            own = Decodes(profile, self.tokens, shown.drafts).speed([chance])
-        even = None if family.drafts.skipped else best.break_even()
-        return Answer(family, best.speed([1.0]), published, own, shown, even and even.accepted_each)
 
 
 def closest(table: Iterable[Recorded], family: Family) -> Recorded | None:
@@ -190,10 +195,6 @@ def closest(table: Iterable[Recorded], family: Family) -> Recorded | None:
             if bool(one.drafts.nodes) == bool(family.drafts.nodes):
                 return one
     return found
-
-
-ACTION = 7
-"""Number of tokens of one action of OpenVLA."""
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from kerv_cli.bench.expected import TABLES, nearest_table
@@ -99,15 +100,15 @@ def family_rows(estimates: Sequence[Estimate]) -> list[Row]:
     """Return one row per family of methods. Each cell lists the figures of all engines."""
     rows = []
     for answers in zip(*[one.answers for one in estimates], strict=True):
-        family = answers[0].family
+        first = answers[0]
         row = {
-            "family": family.name,
-            "method": family.method,
+            "family": first.family,
+            "method": first.method,
             "ceiling": _numbers(answers, "ceiling"),
-            "at the paper's acceptance": _numbers(answers, "published"),
-            "paper reports": family.reported or "–",
-            "at kerv's": _numbers(answers, "own"),
-            "break-even": _numbers(answers, "break_even", "–" if family.drafts.skipped else "never"),
+            "at the paper's acceptance": _numbers(answers, "at_published_acceptance"),
+            "paper reports": first.paper_reports or "–",
+            "at kerv's": _numbers(answers, "at_own_acceptance"),
+            "break-even": _numbers(answers, "break_even_tokens", "never" if first.is_verified else "–"),
         }
         rows.append(row)
     return rows
@@ -161,14 +162,17 @@ def sentence(estimates: Sequence[Estimate]) -> str:
         estimates: Estimates of one policy on one device, one per engine, the best engine first.
     """
     best, worst = estimates[0], estimates[-1]
-    verified = [one for one in best.answers if not one.family.drafts.skipped]
+    verified = [one for one in best.answers if one.is_verified]
     tokens = f"At {best.tokens} token{'s' * (best.tokens != 1)} and {1e3 * best.seconds:.3g} ms per action"
     if not verified:
         return f"{tokens} nothing can be said: the profile has no cost of a draft."
     top = max(verified, key=lambda one: one.ceiling)
     most = max(best.answers, key=lambda one: one.ceiling)
     unverified = f" (unverified drafts, a policy of their own: {most.ceiling:.3g})" if most is not top else ""
-    gains = {f"{one.family.method} ({one.own:.2f} at kerv's acceptance)": one.own for one in verified if one.own}
+    gains = {}
+    for one in verified:
+        if one.at_own_acceptance:
+            gains[f"{one.method} ({one.at_own_acceptance:.2f} at kerv's acceptance)"] = one.at_own_acceptance
     if worst is not best and worst.seconds > best.seconds:
         gain = worst.seconds / best.seconds
         gains[f"a {best.costs.name} engine ({gain:.2f} over {worst.costs.name} code)"] = gain
@@ -195,10 +199,10 @@ def rate(estimates: Sequence[Estimate], hz: float, actions: int) -> str:
     for one in estimates:
         enough, best = [], []
         for answer in one.answers:
-            if answer.own and one.seconds / answer.own <= limit:
-                enough.append(answer.family.method)
+            if answer.at_own_acceptance and one.seconds / answer.at_own_acceptance <= limit:
+                enough.append(answer.method)
             if one.seconds / answer.ceiling <= limit:
-                best.append(answer.family.method)
+                best.append(answer.method)
         who = "no method is"
         if one.seconds <= limit:
             who = "AR is fast enough"
@@ -215,18 +219,8 @@ def document(one: Estimate) -> dict[str, Any]:
     parts = [{"part": name, "ms": 1e3 * taken, "bound": by} for name, (taken, by) in one.parts.items()]
     families = []
     for answer in one.answers:
-        family, own = answer.family, answer.recorded
-        row = {
-            "family": family.name,
-            "method": family.method,
-            "ceiling": answer.ceiling,
-            "at_published_acceptance": answer.published,
-            "paper_reports": family.reported or None,
-            "at_own_acceptance": answer.own,
-            "own_acceptance_from": own and f"results/tables/{own.table}.csv, {own.label}",
-            "break_even_tokens": answer.break_even,
-        }
-        families.append(row)
+        families.append(asdict(answer))
+        del families[-1]["is_verified"]
     about = {"engine": one.costs.name, "ms": 1e3 * one.seconds, "encoder_share": one.encoder}
     return {**about, "parts": parts, "families": families}
 
@@ -235,7 +229,7 @@ def notes(policy: Described | None, estimates: Sequence[Estimate]) -> list[str]:
     """Return the assumptions behind the tables, one line each."""
     table = nearest_table(estimates[0].tokens)
     source = "this installation has no results/tables"
-    if any(one.recorded for one in estimates[0].answers):
+    if any(one.own_acceptance_from for one in estimates[0].answers):
         length = TABLES[table]
         source = f"results/tables/{table}.csv, {length} tokens per chunk, on its own tasks; yours may be lower"
     assumed = [f"assumed: {'; '.join(policy.assumed)}"] if policy and policy.assumed else []

@@ -6,10 +6,10 @@ A trace says which drafts were made and accepted, in a file that any program can
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -152,13 +152,12 @@ def read_trace(path: Path) -> list[TracedDecode]:
     return decodes
 
 
-def grouped(decodes: Sequence[TracedDecode]) -> Iterator[tuple[str, int, list[TracedDecode]]]:
-    """Yield (setting, N, decodes) for each setting and each number N of tokens per chunk."""
+def grouped(decodes: Sequence[TracedDecode]) -> dict[tuple[str, int], list[TracedDecode]]:
+    """Return the decodes of each setting with each number N of tokens per chunk."""
     groups: dict[tuple[str, int], list[TracedDecode]] = {}
     for one in decodes:
         groups.setdefault((one.setting, one.tokens), []).append(one)
-    for (name, tokens), group in groups.items():
-        yield name, tokens, group
+    return groups
 
 
 def work_of_trace(decodes: Sequence[TracedDecode], tokens: int) -> Work:
@@ -168,29 +167,18 @@ def work_of_trace(decodes: Sequence[TracedDecode], tokens: int) -> Work:
         decodes: The decodes, all of the same chunk length.
         tokens: N, number of tokens of a chunk.
     """
-    rounds: list[Mapping[str, str | int]] = []
-    phases = {name: np.zeros(len(decodes)) for name in READ_PHASES}
-    for number_, decode in enumerate(decodes):
-        rounds += map(_counted, decode.rounds)
-        for name in READ_PHASES:
-            phases[name][number_] = decode.seconds.get(name, 0.0)
-        phases["vision"][number_] = decode.encoded
-    columns = {name: np.array(list(map(itemgetter(name), rounds))) for name in COUNTED}
-    counts = np.array([len(one.rounds) for one in decodes])
-    searched = np.array([one.searched for one in decodes])
-    return work_of(columns, counts, phases, searched, tokens)
-
-
-def _counted(one: TracedRound) -> Mapping[str, str | int]:
-    """Return the attributes of a round that the cost model reads."""
-    return {
-        "mode": one.mode,
-        "proposer": one.proposer,
-        "start": one.start,
-        "tree_size": one.drafted,
-        "accepted": one.accepted,
-        "levels": one.depth,
-    }
+    columns, phases, rounds = {}, {}, list[TracedRound]()
+    counts, searched = [], []
+    for decode in decodes:
+        rounds += decode.rounds
+        counts.append(len(decode.rounds))
+        searched.append(decode.searched)
+    for name, attribute in zip(COUNTED, ("mode", "proposer", "start", "drafted", "accepted", "depth"), strict=True):
+        columns[name] = np.array(list(map(attrgetter(attribute), rounds)))
+    for name in READ_PHASES:
+        phases[name] = np.array([decode.seconds.get(name, 0.0) for decode in decodes])
+    phases["vision"] = np.array([decode.encoded for decode in decodes])
+    return work_of(columns, np.array(counts), phases, np.array(searched), tokens)
 
 
 def price(trace: Sequence[TracedDecode], costs: NamedProfile) -> list[dict[str, Any]]:
@@ -205,7 +193,7 @@ def price(trace: Sequence[TracedDecode], costs: NamedProfile) -> list[dict[str, 
         UsageError: The profile lacks a cost, or has costs for shorter chunks only.
     """
     found = []
-    for name, tokens, decodes in grouped(trace):
+    for (name, tokens), decodes in grouped(trace).items():
         work = work_of_trace(decodes, tokens)
         costs.check(tokens, work.needs, name)
         of_decode, episode = prices(work, costs.profile), _numbers(decodes)
@@ -268,7 +256,7 @@ def choose_length(trace: Sequence[TracedDecode], costs: NamedProfile) -> list[di
         UsageError: The trace has no chain, or the profile lacks a cost.
     """
     found = []
-    for name, tokens, decodes in grouped(trace):
+    for (name, tokens), decodes in grouped(trace).items():
         tried, accepted = _counts(decodes)
         if not len(tried):
             continue

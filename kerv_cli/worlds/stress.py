@@ -292,9 +292,14 @@ class Objects(Stress):
             model.dof_damping[dofs] *= friction
             model.dof_frictionloss[dofs] *= friction
             growth = size if _is_free_and_primitive(model, body) else 1.0
-            for part in np.flatnonzero(model.body_weldid == body):
-                _scale(model, int(part), growth, moved=part != body)
-                _weigh(model, int(part), mass, growth)
+            for part in np.flatnonzero(model.body_weldid == body).tolist():
+                _scale(model, part, growth, moved=part != body)
+                # and what MuJoCo derives from the mass
+                model.body_mass[part] *= mass
+                model.body_inertia[part] *= mass * growth**2
+                model.body_invweight0[part] /= mass
+                dofs = slice(model.body_dofadr[part], model.body_dofadr[part] + model.body_dofnum[part])
+                model.dof_invweight0[dofs] /= mass
         model.body_subtreemass[:] = model.body_mass
         for body in range(model.nbody - 1, 0, -1):
             model.body_subtreemass[model.body_parentid[body]] += model.body_subtreemass[body]
@@ -333,22 +338,6 @@ def _scale(model: Model, body: int, factor: float, moved: bool) -> None:
         values[geoms] *= factor
     model.site_pos[sites] *= factor
     model.bvh_aabb[model.body_bvhadr[body] : model.body_bvhadr[body] + model.body_bvhnum[body]] *= factor
-
-
-def _weigh(model: Model, body: int, mass: float, size: float) -> None:
-    """Scale the mass of a body, and the values that MuJoCo derives from the mass.
-
-    Args:
-        model: The model.
-        body: Id of the body.
-        mass: Factor of the mass.
-        size: Factor by which the body's size was scaled.
-    """
-    model.body_mass[body] *= mass
-    model.body_inertia[body] *= mass * size**2
-    model.body_invweight0[body] /= mass
-    dofs = slice(model.body_dofadr[body], model.body_dofadr[body] + model.body_dofnum[body])
-    model.dof_invweight0[dofs] /= mass
 
 
 PUSH_SECONDS = 0.1

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import read_mapping, sha256_of
@@ -15,9 +15,6 @@ from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds import EnvironmentPart, Task, stands_for_tasks
 from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames, load_episode
 from kerv_cli.worlds.spec import EnvironmentSpec
-
-if TYPE_CHECKING:
-    pass
 
 OnProgress = Callable[[int, int], object]
 """Reports progress: called with (done, total) after every episode or batch."""
@@ -98,6 +95,12 @@ class DemoManifest:
     episodes: int = 0
     missing: int = 0
     instructions: dict[str, str] = field(default_factory=dict)
+
+
+def _facts(manifest: DemoManifest) -> dict[str, Any]:
+    """Return what must be equal in datasets that are joined."""
+    spaces = {"action space": manifest.actions, "observation space": manifest.observation}
+    return {"environment": manifest.environment, **spaces, "camera": manifest.config["camera"]}
 
 
 def register_recorded(
@@ -263,16 +266,10 @@ class DemoDataset:
         """
         if len(parts) == 1:
             return parts[0]
-        first = parts[0].manifest
+        first, ours = parts[0].manifest, _facts(parts[0].manifest)
         for part in parts[1:]:
-            other = part.manifest
-            for what, ours, theirs in (
-                ("environment", first.environment, other.environment),
-                ("action space", first.actions, other.actions),
-                ("observation space", first.observation, other.observation),
-                ("camera", first.config["camera"], other.config["camera"]),
-            ):
-                if ours != theirs:
+            for what, value in _facts(part.manifest).items():
+                if value != ours[what]:
                     raise CheckpointError(f"{part.path} has another {what} than {parts[0].path}: they cannot be joined")
         combined = hashlib.sha256("\n".join(part.sha256 for part in parts).encode()).hexdigest()
         config = {**first.config, "joined": [part.manifest.config for part in parts[1:]]}
@@ -302,4 +299,5 @@ class DemoDataset:
         frames = episode.frames
         if not self.views or not isinstance(frames, EncodedFrames):
             return episode
-        return replace(episode, frames=frames.left(self.views * frames.size))
+        frames = EncodedFrames(frames.files, frames.spans, frames.size, self.views * frames.size)  # the first views
+        return replace(episode, frames=frames)

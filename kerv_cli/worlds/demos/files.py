@@ -31,14 +31,8 @@ from kerv_cli.base.files import atomic_path, regular
 
 FORMAT = "1"
 """Version of the episode files' format."""
-_ARRAYS = {
-    "frame_steps": "frame_steps",
-    "states": "states",
-    "labels": "labels",
-    "executed": "executed",
-    "initial_state": "rand_vec",  # its name in Meta-World
-}
-"""Attribute of an episode -> name of its tensor in the file."""
+_ARRAYS = ("frame_steps", "states", "labels", "executed")
+"""Arrays of an episode that have the same name in its file. `initial_state` is `rand_vec`, its name in Meta-World."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +108,8 @@ def save_episode(path: Path, episode: DemoEpisode, level: int = 6) -> None:
         tensors = {
             "png": np.zeros(0, np.uint8),  # the pictures follow
             "png_offsets": np.cumsum([0, *sizes], dtype=np.int64),
-            **{name: getattr(episode, attribute) for attribute, name in _ARRAYS.items()},
+            **{name: getattr(episode, name) for name in _ARRAYS},
+            "rand_vec": episode.initial_state,
         }
         # Not safetensors' save_file: on a full disk it raises its own type of error.
         data = save(tensors, metadata=metadata)
@@ -141,12 +136,23 @@ def load_episode(path: Path) -> DemoEpisode:
             metadata = file.metadata() or {}
             if metadata.get("format") != FORMAT:
                 raise CheckpointError(f"{path} is not a demonstration episode of format {FORMAT}")
-            arrays = {attribute: file.get_tensor(name) for attribute, name in _ARRAYS.items()}
+            arrays = {name: file.get_tensor(name) for name in _ARRAYS}
+            arrays["initial_state"] = file.get_tensor("rand_vec")
             offsets = file.get_tensor("png_offsets")
-        steps, seed = int(metadata["steps"]), int(metadata["seed"])
-        frames = EncodedFrames.of_file(path, offsets, int(metadata["frame_size"]), int(metadata.get("frame_width", 0)))
-        perturbed = metadata["perturbed"] == "true"
-        return DemoEpisode(metadata["task"], seed, perturbed, steps, frames, **arrays)
+        with path.open("rb") as data:
+            length = data.read(LENGTH.size)
+            header, begin = header_of(length + data.read(LENGTH.unpack(length)[0]))
+        positions = offsets + begin + header["png"]["data_offsets"][0]
+        spans = np.stack([np.zeros(len(positions) - 1, np.int64), positions[:-1], positions[1:]], axis=1)
+        height = int(metadata["frame_size"])
+        return DemoEpisode(
+            task=metadata["task"],
+            seed=int(metadata["seed"]),
+            perturbed=metadata["perturbed"] == "true",
+            steps=int(metadata["steps"]),
+            frames=EncodedFrames([path], spans, height, int(metadata.get("frame_width", height))),
+            **arrays,
+        )
     except (OSError, SafetensorError, KeyError, ValueError) as error:
         raise CheckpointError(f"{path} is missing or damaged: {error}") from error
 
@@ -167,23 +173,6 @@ class EncodedFrames:
 
     def __init__(self, files: Sequence[Path], spans: NDArray[np.int64], size: int, width: int) -> None:
         self.files, self.spans, self.size, self.width = files, spans, size, width
-
-    @classmethod
-    def of_file(cls, path: Path, offsets: NDArray[np.int64], size: int, width: int = 0) -> EncodedFrames:
-        """Return the images of an episode's file without decoding them.
-
-        Args:
-            path: The file.
-            offsets: (n + 1,) positions of the PNG files in the tensor `png`.
-            size: Height in pixels.
-            width: Width in pixels. 0: the images are square.
-        """
-        with path.open("rb") as file:
-            length = file.read(LENGTH.size)
-            header, begin = header_of(length + file.read(LENGTH.unpack(length)[0]))
-        positions = offsets + begin + header["png"]["data_offsets"][0]
-        spans = np.stack([np.zeros(len(offsets) - 1, np.int64), positions[:-1], positions[1:]], axis=1)
-        return cls([path], spans, size, width or size)
 
     @classmethod
     def joined(cls, parts: Sequence[EncodedFrames]) -> EncodedFrames:
@@ -219,10 +208,6 @@ class EncodedFrames:
             return self._decode(int(chosen))
         rows = chosen if isinstance(chosen, slice) else np.asarray(chosen)
         return EncodedFrames(self.files, self.spans[rows], self.size, self.width)
-
-    def left(self, width: int) -> EncodedFrames:
-        """Return the leftmost `width` pixels of the same images, so that only the first views remain."""
-        return EncodedFrames(self.files, self.spans, self.size, width)
 
     def pixels(self) -> NDArray[np.uint8]:
         """Decode all images (n, size, width, 3), on several threads if the process has several CPU cores."""

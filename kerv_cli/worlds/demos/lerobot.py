@@ -271,7 +271,12 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
     for row in chosen:
         of_files.setdefault(source.data_path(row), []).append(row)
     for path, rows in of_files.items():
-        _check_episodes(path, len(rows))
+        with _reading(path):
+            most = max(FEW_EPISODES, path.stat().st_size // EPISODE_BYTES)
+        if len(rows) > most:
+            raise CheckpointError(
+                f"{path} holds {len(rows)} episodes, at most {most} are read from a file of this size: give episodes=N"
+            )
     for path, rows in of_files.items():
         table = _table(path, ["episode_index", "task_index", *VECTORS, source.key], allowed(path, ROWS_RATIO))
         for row in rows:
@@ -356,24 +361,6 @@ def _observation(source: Source, state: int, world: EnvironmentSpec) -> Observat
         f"{source.folder} has {state} numbers of state, {world.name} has {alone.state} of proprioception "
         f"({STATE}) and {whole.state} in all ({ENVIRONMENT})"
     )
-
-
-def _check_episodes(path: Path, count: int) -> None:
-    """Refuse a data file that holds more episodes than fit into it.
-
-    Args:
-        path: The file.
-        count: Number of its episodes.
-
-    Raises:
-        CheckpointError: The file holds more than FEW_EPISODES episodes, and they have less than EPISODE_BYTES each.
-    """
-    with _reading(path):
-        most = max(FEW_EPISODES, path.stat().st_size // EPISODE_BYTES)
-    if count > most:
-        raise CheckpointError(
-            f"{path} holds {count} episodes, at most {most} are read from a file of this size: give episodes=N"
-        )
 
 
 def _episode(source: Source, row: Row, path: Path, table: pa.Table, names: Mapping[int, str], tail: int) -> DemoEpisode:

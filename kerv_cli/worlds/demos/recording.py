@@ -132,11 +132,7 @@ def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None)
         act = Perturbation(world.task, seed, world.spec.actions)
     states, labels, executed, frames, frame_steps = [], [], [], [], []
     last_step = min(config.horizon, world.horizon - config.tail)
-    while not world.success:
-        if world.steps >= last_step:
-            if actor is None:
-                return None
-            break
+    while not world.success and world.steps < last_step:
         if world.steps % config.frame_stride == 0:
             frames.append(world.frame())
             frame_steps.append(world.steps)
@@ -144,6 +140,8 @@ def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None)
         labels.append(expert(observation))
         executed.append(act(labels[-1]) if act else labels[-1])
         observation = world.step(executed[-1])
+    if not world.success and actor is None:
+        return None
     for _ in range(config.tail):
         labels.append(expert(observation))
         observation = world.step(labels[-1])
@@ -313,25 +311,24 @@ def _record_seeds(
     Returns:
         The task's name; and for each seed the manifest's entry of its episode, or None if the expert failed.
     """
-    actor = make_actor(config) if make_actor else None
+    actor, outcomes = make_actor(config) if make_actor else None, _Outcomes()
     with config.spec.open_world(task, config.camera) as world:
-        return task, {seed: _record_seed(config, out, world, seed, actor) for seed in seeds}
-
-
-def _record_seed(config: DemoConfig, out: Path, world: World, seed: int, actor: Actor | None) -> EpisodeEntry | None:
-    """Record one seed unless its file exists. Return its entry for the manifest, or None if the expert failed."""
-    path, failure = episode_path(out, world.task, seed), out / "failed" / world.task / f"{seed:06d}.json"
-    if failure.exists():
-        return None
-    with contextlib.suppress(CheckpointError):  # missing or damaged: record it again
-        return EpisodeEntry.of(path, load_episode(path))
-    recorded = run_expert(world, seed, config, actor)
-    if recorded is None:
-        perturbed = is_perturbed(seed, config.perturbed)
-        write_json(failure, {"task": world.task, "seed": seed, "perturbed": perturbed})
-        return None
-    save_episode(path, recorded)
-    return EpisodeEntry.of(path, recorded)
+        for seed in seeds:
+            path, failure = episode_path(out, world.task, seed), out / "failed" / world.task / f"{seed:06d}.json"
+            outcomes[seed] = None
+            if failure.exists():
+                continue
+            with contextlib.suppress(CheckpointError):  # missing or damaged: record it again
+                outcomes[seed] = EpisodeEntry.of(path, load_episode(path))
+                continue
+            recorded = run_expert(world, seed, config, actor)
+            if recorded is None:
+                perturbed = is_perturbed(seed, config.perturbed)
+                write_json(failure, {"task": world.task, "seed": seed, "perturbed": perturbed})
+            else:
+                save_episode(path, recorded)
+                outcomes[seed] = EpisodeEntry.of(path, recorded)
+    return task, outcomes
 
 
 SIGMA = 0.2, 0.6
