@@ -3,7 +3,7 @@
 import json
 import re
 from collections import Counter
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -70,7 +70,7 @@ def test_a_space_survives_its_json_and_a_damaged_one_gets_one_line():
     for space in (SPEC.actions, INSERTION.actions):
         assert read(ActionSpace, json.loads(json.dumps(space.as_dict())), "a space") == space
     for space in (SPEC.observation, INSERTION.observation):
-        assert read(ObservationSpace, json.loads(json.dumps(space.as_dict())), "a space") == space
+        assert read(ObservationSpace, json.loads(json.dumps(asdict(space))), "a space") == space
     wrong = (
         {"names": 1},
         {**SPACE.as_dict(), "more": 1},

@@ -125,8 +125,7 @@ class FastCode:
         """Return the motions (n, H, D) of coefficients (n, H · D): normalised actions that are not clipped yet."""
         from scipy.fft import idct
 
-        found: np.ndarray = idct(coefficients.reshape(-1, self.steps, self.dofs) / self.scale, axis=1, norm="ortho")
-        return found
+        return idct(coefficients.reshape(-1, self.steps, self.dofs) / self.scale, axis=1, norm="ortho")
 
     def values(self, coefficients: Sequence[int]) -> np.ndarray:
         """Return the normalised actions (H, D) of at most H · D rounded coefficients. Missing coefficients are 0."""

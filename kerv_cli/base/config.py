@@ -107,7 +107,7 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     if typed.get("quick"):
         typed = read_yaml_lines(conf_dir() / "quick.yaml", "quick=true")[0].get(command, {}) | typed
     choices, known = choices_of(schema), choices_of(schema)
-    preset = next((group for group in PRESETS if group in choices), "")
+    preset = next(filter(choices.__contains__, PRESETS), "")
     parts_of_file, values, lines = _read_preset(preset, str(typed.get(preset, choices.pop(preset, ""))))
     choices |= parts_of_file
     for key, value in typed.items():
@@ -203,8 +203,7 @@ def _read_preset(group: str, name: str) -> tuple[dict[str, str], list[tuple[str,
     lines = {f"{prefix}{key}": f"{path}:{number}: " for key, number in numbers.items()}
     if "defaults" in content and not prefix:
         raise UsageError(f"{lines['defaults']}a method's file has no defaults: write PART: NAME, as proposer: drafter")
-    choices: dict[str, str] = {}
-    values: list[tuple[str, Any]] = []
+    choices, values = dict[str, str](), list[tuple[str, Any]]()
     for key, value in content.items():
         if not prefix and key in SETTINGS_GROUPS and isinstance(value, str):
             choices[key] = value
@@ -302,7 +301,8 @@ def _open_mappings(node: Any) -> None:
     """Let overrides add keys to the untyped mappings of a schema, such as `policy.artifacts`."""
     from omegaconf import DictConfig, OmegaConf
 
-    for child in (node[name] for name in node if not OmegaConf.is_missing(node, name)):
+    for name in node:
+        child = None if OmegaConf.is_missing(node, name) else node[name]
         if isinstance(child, DictConfig) and OmegaConf.get_type(child) is dict:
             OmegaConf.set_struct(child, False)
         elif isinstance(child, DictConfig):

@@ -60,6 +60,23 @@ def storage_errors(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def _temporary(path: Path) -> Iterator[Path]:
+    """Yield a new temporary path beside `path`, which the `with` block fills and then renames to `path`.
+
+    The parent folder is created. What is still at the temporary path after the block is removed.
+    """
+    temporary = temporary_beside(path)
+    try:
+        with storage_errors(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            clean_once(path.parent)
+            yield temporary
+            sync(path.parent)
+    finally:
+        remove(temporary)
+
+
+@contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """Write a file atomically: yield a temporary path, and rename it to `path` at the end of the `with` block.
 
@@ -69,18 +86,11 @@ def atomic_path(path: Path) -> Iterator[Path]:
     Raises:
         StorageError: The disk is full or read-only, or permission is missing.
     """
-    temporary = temporary_beside(path)
-    try:
-        with storage_errors(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            clean_once(path.parent)
-            temporary.touch(exist_ok=False)
-            yield temporary
-            sync(temporary)
-            os.replace(temporary, path)
-            sync(path.parent)
-    finally:
-        remove(temporary)
+    with _temporary(path) as temporary:
+        temporary.touch(exist_ok=False)
+        yield temporary
+        sync(temporary)
+        os.replace(temporary, path)
 
 
 def write_folder(folder: Path, fill: Callable[[Path], object]) -> None:
@@ -95,22 +105,15 @@ def write_folder(folder: Path, fill: Callable[[Path], object]) -> None:
     Raises:
         StorageError: The disk is full or read-only, or permission is missing.
     """
-    temporary = temporary_beside(folder)
-    try:
-        with storage_errors(folder):
-            folder.parent.mkdir(parents=True, exist_ok=True)
-            clean_once(folder.parent)
-            temporary.mkdir()
-            fill(temporary)
-            for path in (*temporary.rglob("*"), temporary):
-                sync(path)
-            if folder.exists():
-                _exchange(temporary, folder)
-            else:
-                os.rename(temporary, folder)
-            sync(folder.parent)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    with _temporary(folder) as temporary:
+        temporary.mkdir()
+        fill(temporary)
+        for path in (*temporary.rglob("*"), temporary):
+            sync(path)
+        if folder.exists():
+            _exchange(temporary, folder)
+        else:
+            os.rename(temporary, folder)
 
 
 def set_aside(folder: Path) -> Path:
@@ -289,11 +292,10 @@ def read_yaml_lines(path: Path, what: str) -> tuple[dict[str, Any], dict[str, in
         value = loader.construct_document(node) if node else {}
     except (OSError, ValueError, RecursionError) as error:
         raise UsageError(f"{what} cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    except yaml.MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else 1
-        raise UsageError(f"{path}:{line}: it is not YAML, {error.problem}") from error
-    except yaml.YAMLError as error:  # a character that no YAML file may have, such as NUL
-        raise UsageError(f"{path}: it is not YAML, {' '.join(str(error).split())}") from error
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)  # a character that no YAML file may have, such as NUL, has none
+        why = getattr(error, "problem", None) or " ".join(str(error).split())
+        raise UsageError(f"{path}{f':{mark.line + 1}' if mark else ''}: it is not YAML, {why}") from error
     if not isinstance(value, dict):
         raise UsageError(f"{what} holds no keys: write key: value")
     return value, lines

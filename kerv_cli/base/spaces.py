@@ -69,7 +69,8 @@ class ActionSpace:
     def __post_init__(self) -> None:
         if not self.names or len(set(self.names)) != len(self.names):
             raise ValueError(f"DoFs need names of their own: {self.names}")
-        if sum(group.size for group in self.groups) != self.dofs or any(group.size < 1 for group in self.groups):
+        sizes = [group.size for group in self.groups]
+        if sum(sizes) != self.dofs or min(sizes) < 1:
             raise ValueError(f"groups {self.groups} do not cover the {self.dofs} DoFs in order")
         if not set(self.strict) <= set(self.names):
             raise ValueError(f"strict {self.strict} names a DoF that is not there: {self.names}")
@@ -132,7 +133,7 @@ class ActionSpace:
     @cached_property
     def is_strict(self) -> np.ndarray:
         """(D,) bool: which DoFs are strict, so that their tokens must equal the target's."""
-        return np.array([name in self.strict for name in self.names])
+        return np.isin(self.names, self.strict)
 
     @cached_property
     def bounds(self) -> tuple[tuple[int, int], ...]:
