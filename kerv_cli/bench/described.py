@@ -159,8 +159,8 @@ def _of_config(settings: EstimateSettings, config: Mapping[str, Any], file: Path
     if config.get("model_type") == "openvla":
         read = read_shape(file.parent)
         return Described(openvla("openvla", read.language, read.towers), 7)
-    texts = [config, *(config[key] for key in ("text_config", "llm_config", "language_config") if key in config)]
-    text = next((one for one in reversed(texts) if "vocab_size" in one and "hidden_size" in one), None)
+    texts = config.get("language_config"), config.get("llm_config"), config.get("text_config"), config
+    text = next((one for one in texts if one and "vocab_size" in one and "hidden_size" in one), None)
     if text is None or config.get("type") in _CONTINUOUS:
         return Described(None, 0)
     width, heads = _size(text, "hidden_size"), _size(text, "num_attention_heads", 1)

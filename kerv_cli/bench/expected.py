@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import functools
-import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -65,10 +64,6 @@ class Means(NamedTuple):
         """Return the mean of two cases: `other` has the probability `share`, and these means have 1 − `share`."""
         return Means(*((1 - share) * x + share * y for x, y in zip(self, other, strict=True)))
 
-    def plus(self, other: Means) -> Means:
-        """Return the sums of these means and `other`: the means of two parts of a decode that follow one another."""
-        return Means(*map(operator.add, self, other))
-
 
 @dataclass(frozen=True)
 class Decodes:
@@ -115,9 +110,8 @@ class Decodes:
         after = [Means()] * (self.tokens + 1)
         for start in range(self.tokens - 1, 0, -1):
             after[start] = self._round(start, acceptance, after)
-        first = Means(self._cost("encode", 1) + self._source)
         prefill = self._forward("prefill", self.profile.prompt + size, size, 0, acceptance, after)
-        return first.plus(prefill)
+        return prefill._replace(seconds=self._cost("encode", 1) + self._source + prefill.seconds)
 
     def acceptance_for(self, forwards: float) -> float:
         """Return the smallest acceptance probability at which a verified decode takes `forwards` forwards or fewer.
@@ -158,8 +152,8 @@ class Decodes:
             return self._forward("verify", 1, 0, start, acceptance, after)
         nodes = min(drafts.nodes, _TOP + (depth - 1) * _TOP**2) if drafts.nodes else depth
         kind = "tree" if drafts.nodes and not self.profile.lacks(["tree"]) else DRAFTING
-        draft = Means(self._cost(kind, depth if kind == "tree" else nodes))
-        own = draft.plus(self._forward("verify", 1 + nodes, depth, start, acceptance, after))
+        own = self._forward("verify", 1 + nodes, depth, start, acceptance, after)
+        own = own._replace(seconds=self._cost(kind, depth if kind == "tree" else nodes) + own.seconds)
         if not drafts.retrieved:
             return own
         searched = self._forward("verify", 1 + most, most, start, acceptance, after)

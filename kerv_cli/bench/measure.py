@@ -376,51 +376,30 @@ def card_of(model: Model, machine: Machine) -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True)
-class Bench:
-    """The results of a benchmark.
+def title_of(model: Model) -> str:
+    """Return the title of the table of phases: target, number format, device, threads."""
+    dtype, where = str(model.dtype).removeprefix("torch."), stamp(str(model.target.device))["device_name"]
+    return f"{model.name}, {dtype}, {where}, {torch.get_num_threads()} thread, caches cold at first"
 
-    Attributes:
-        model: The measured model.
-        machine: The device's measured bandwidth and operations per second.
-        phases: Measured times of the phases of a decode.
-        profile: Median seconds by kind and rows of a phase, from which the time of a decode can be computed.
-    """
 
-    model: Model
-    machine: Machine
-    phases: list[Phase]
-    profile: Profile
-
-    @property
-    def dtype(self) -> str:
-        """Number format of the trunk, such as `float32`."""
-        return str(self.model.dtype).removeprefix("torch.")
-
-    @property
-    def title(self) -> str:
-        """Title of the table of phases: target, number format, device, threads."""
-        where = stamp(str(self.model.target.device))["device_name"]
-        return f"{self.model.name}, {self.dtype}, {where}, {torch.get_num_threads()} thread, caches cold at first"
-
-    def document(self) -> dict[str, Any]:
-        """Return all results for JSON (docs/formats.md)."""
-        device = self.model.target.device
-        return {
-            "target": self.model.name,
-            "random_weights": self.model.is_shape,
-            "dtype": self.dtype,
-            "device": str(device),
-            "threads": torch.get_num_threads(),
-            **stamp(str(device)),
-            "card": card_of(self.model, self.machine),
-            "phases": list(map(Phase.as_dict, self.phases)),
-            "profile": self.profile.as_dict(),
-        }
+def document(model: Model, machine: Machine, phases: Sequence[Phase]) -> dict[str, Any]:
+    """Return the results of a benchmark for JSON (docs/formats.md); arguments from `measure`."""
+    device = str(model.target.device)
+    return {
+        "target": model.name,
+        "random_weights": model.is_shape,
+        "dtype": str(model.dtype).removeprefix("torch."),
+        "device": device,
+        "threads": torch.get_num_threads(),
+        **stamp(device),
+        "card": card_of(model, machine),
+        "phases": list(map(Phase.as_dict, phases)),
+        "profile": profile_of(phases, model.size).as_dict(),
+    }
 
 
 @torch.inference_mode()
-def measure(model: Model, machine: Machine, settings: BenchSettings) -> Bench:
+def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Machine, list[Phase]]:
     """Measure the time of each phase of a decode (prefill, verify, …).
 
     All decoders run in turn, `settings.repeats` times.
@@ -430,6 +409,9 @@ def measure(model: Model, machine: Machine, settings: BenchSettings) -> Bench:
         machine: The device's measured bandwidth and operations per second. Both are measured again after the decodes;
             the higher values count.
         settings: Settings of the benchmark.
+
+    Returns:
+        The device's bandwidth and operations per second after all measurements, and the phases.
     """
     device, evicting = model.target.device, torch.ones(_EVICTING)
     every, sources = decoders(model), source_decoders(settings)
@@ -453,5 +435,4 @@ def measure(model: Model, machine: Machine, settings: BenchSettings) -> Bench:
                 seconds.setdefault(key, []).append(value)
     machine = machine.best_of(measure_machine(device, model.dtype))
     drafts = {(kind, 1): needs_of_draft(source) for kind, source in sources.items()}
-    phases = phases_of(seconds, model.sizes, machine, drafts)
-    return Bench(model, machine, phases, profile_of(phases, model.size))
+    return machine, phases_of(seconds, model.sizes, machine, drafts)

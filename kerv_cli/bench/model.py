@@ -77,8 +77,7 @@ class Model:
     @property
     def dtype(self) -> torch.dtype:
         """Number format of the trunk's weights."""
-        dtype: torch.dtype = self.target.dtype
-        return dtype
+        return self.target.dtype
 
 
 def random_target(shape: TargetSettings, device: torch.device, dtype: torch.dtype) -> CompactTarget:

@@ -21,6 +21,7 @@ from kerv_cli.base.limits import number
 from kerv_cli.bench.expected import Decodes, Drafts
 from kerv_cli.engine.cost import COUNTED, READ_PHASES, Work, prices, work_of
 from kerv_cli.engine.record import PARALLEL
+from kerv_cli.engine.tree import TokenTree
 from kerv_cli.report.profiles import NamedProfile
 
 MOST = 1_000_000  # of every count in a trace
@@ -86,12 +87,7 @@ class TracedRound:
     @property
     def depth(self) -> int:
         """Number of levels of a drafted tree. 0 for a chain."""
-        if self.levels or self.parents == list(range(-1, len(self.parents) - 1)):
-            return self.levels
-        depths: list[int] = []
-        for parent in self.parents:
-            depths.append(1 if parent < 0 else depths[parent] + 1)
-        return max(depths)
+        return self.levels or TokenTree.build(self.parents, self.parents).levels
 
 
 @dataclass(frozen=True)

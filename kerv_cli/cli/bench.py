@@ -33,19 +33,19 @@ def bench(settings: BenchSettings, as_json: AsJson = False) -> None:
     if settings.projected != "none":
         _project(settings, as_json)
         return
-    from kerv_cli.bench.measure import card_of, measure, measure_machine
+    from kerv_cli.bench.measure import card_of, document, measure, measure_machine, title_of
     from kerv_cli.bench.model import open_model
     from kerv_cli.bench.tables import card_rows, phase_rows
 
     model = open_model(settings)
     machine = measure_machine(model.target.device, model.dtype)
     print_table(("card", ""), card_rows(card_of(model, machine)), f"{model.name}, {model.dtype}".replace("torch.", ""))
-    done = measure(model, machine, settings)
-    print_rows(phase_rows(done.phases), done.title)
-    document = done.document()
-    _write(settings, f"{model.name.rstrip('/').rsplit('/', 1)[-1]}-{done.dtype}", document)
+    machine, phases = measure(model, machine, settings)
+    print_rows(phase_rows(phases), title_of(model))
+    result = document(model, machine, phases)
+    _write(settings, f"{model.name.rstrip('/').rsplit('/', 1)[-1]}-{result['dtype']}", result)
     if as_json:
-        typer.echo(json.dumps(document, allow_nan=False))
+        typer.echo(json.dumps(result, allow_nan=False))
 
 
 def _project(settings: BenchSettings, as_json: bool) -> None:
