@@ -15,7 +15,7 @@ from starlette.routing import Route
 from kerv_cli.base.errors import UnknownName
 from kerv_cli.board import episode
 from kerv_cli.board.pages import database_of, render
-from kerv_cli.catalogue.episodes import outcomes, settings_in
+from kerv_cli.catalogue.episodes import outcomes
 from kerv_cli.episodes.identity import Setting, stress_of
 from kerv_cli.lab.store import Study
 from kerv_cli.report.measures import NEAR
@@ -184,7 +184,8 @@ def _asked(request: Request) -> tuple[list[Cell], dict[str, Any]]:
         UnknownName: The study has no such setting or task.
     """
     store = Study(database_of(request), request.path_params["name"])
-    baseline, settings = settings_in(store)
+    study = store.load()
+    baseline, settings = study.baseline, {one.label: one for one in study.settings}
     cells = cells_of(outcomes(store), baseline, settings)
     known = {"setting": list(settings), "task": sorted(set(map(attrgetter("task"), cells)))}
     chosen = {name: request.query_params.get(name, "") for name in known}

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import dataclasses
 import fnmatch
-import io
 import json
 import os
 import re
@@ -15,7 +13,7 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +27,7 @@ from kerv_cli.base.registry import ArtifactPart
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.lab.database import ABOUT, EPISODES, SETTINGS, STUDIES, WANTED, Database
-from kerv_cli.lab.plan import ALL, Episode
+from kerv_cli.lab.plan import ALL
 from kerv_cli.lab.runs import COMPLETE, RUNNING, RunRow, forget, interrupted, run_rows, time_left
 from kerv_cli.lab.store import IMPORT, ROLLOUT, SWEEP, Study
 
@@ -114,11 +112,6 @@ class RunEntry:
         """Whether a process is now making the study or artifact."""
         return self.state.startswith(RUNNING)
 
-    @property
-    def is_training(self) -> bool:
-        """Whether the entry is a training, or has weights that were imported or copied."""
-        return not self.has_episodes and ((self.folder / LOG).is_file() or (self.folder / WEIGHTS).is_file())
-
 
 def few(names: Sequence[str], most: int = 3) -> str:
     """Return the first names, and how many more there are: `ar, kerv, jacobi +4`."""
@@ -127,12 +120,13 @@ def few(names: Sequence[str], most: int = 3) -> str:
 
 def find_runs(database: Database) -> list[RunEntry]:
     """Return all entries of a database and its results folder, newest first."""
-    folder = database.results / "artifacts"
-    found = {(one.kind, one.folder.name): one for one in _studies(database)}
-    for parent in (database.results / "studies", database.results / "rollouts"):
-        _clean(parent)
+    folder, found = database.results / "artifacts", {}
+    for name in ("studies", "rollouts"):
+        clean(database.results / name)
+    for one in _studies(database):
+        found[one.kind, one.folder.name] = one
     for kind in artifact_kinds():
-        _clean(folder / kind)
+        clean(folder / kind)
         for path in visible(folder / kind):
             # an interrupted recording and a training before its first validation have no description yet
             if any(map(Path.is_file, (_description(path, kind), path / "recording.json", path / LOG))):
@@ -150,14 +144,9 @@ def find_runs(database: Database) -> list[RunEntry]:
             entry = RunEntry(f"{kind}/{name}", kind, folder / kind / name, "", "", (kind,))
         found[kind, name] = _with_command(entry, row, (kind, name, row.command) in finished)
     labels = labels_in(database)
-    runs = [replace(run, labels=labels.get(run.id, {})) for run in found.values()]
-    return sorted(runs, key=attrgetter("started", "id"), reverse=True)
-
-
-def _clean(folder: Path) -> None:
-    """Remove what killed commands left in a folder, if it can be read."""
-    with contextlib.suppress(OSError):
-        clean(folder)
+    for key, run in found.items():
+        found[key] = replace(run, labels=labels.get(run.id, {}))
+    return sorted(found.values(), key=attrgetter("started", "id"), reverse=True)
 
 
 def _with_command(entry: RunEntry, row: RunRow, is_finished: bool) -> RunEntry:
@@ -198,13 +187,17 @@ def find_run(database: Database, name: str, exact: bool = False) -> RunEntry:
         raise UsageError(f"no runs in {database.results}: make one with 'kerv rollout method=spec_vla task=reach'")
     if name == LAST and not exact:
         return runs[0]
-    by_id = {one.id: one for one in runs}
-    found = [name] if name in by_id or exact else [one for one in by_id if name in one]
+    found: dict[str, RunEntry] = {}
+    for one in runs:
+        if one.id == name:
+            return one
+        if name in one.id and not exact:
+            found[one.id] = one
     if len(found) > 1:
-        raise UsageError(f"'{name}' is a part of {len(found)} runs: {', '.join(found[:5])}")
-    if not found or found[0] not in by_id:
-        raise UnknownName("run", name, list(by_id))
-    return by_id[found[0]]
+        raise UsageError(f"'{name}' is a part of {len(found)} runs: {', '.join(list(found)[:5])}")
+    if not found:
+        raise UnknownName("run", name, map(attrgetter("id"), runs))
+    return next(iter(found.values()))
 
 
 def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry]:
@@ -276,8 +269,7 @@ def _studies(database: Database) -> Iterator[RunEntry]:
         studies, tasks = connection.execute(sa.select(STUDIES)).all(), connection.execute(sums).all()
         settings = connection.execute(of_setting).all()
     for study in studies:
-        methods: dict[str, None] = {}
-        made_from: dict[str, str] = {}
+        methods, made_from = dict[str, None](), dict[str, str]()
         for one in settings:
             if one.study_id == study.id:
                 methods[one.method] = None
@@ -331,48 +323,37 @@ def _description(folder: Path, kind: str) -> Path:
 
 def artifact_entry(folder: Path, kind: str) -> RunEntry:
     """Return the entry of an artifact in a folder. Its state is `damaged` if its files cannot be read."""
-    changed = [path.stat().st_mtime for path in visible(folder) if path.is_file()]
+    changed = map(os.path.getmtime, filter(Path.is_file, visible(folder)))
     started = datetime.fromtimestamp(max(changed, default=0.0), UTC).isoformat(timespec="milliseconds")[:23]
     run = RunEntry(f"{kind}/{folder.name}", kind, folder, started, "damaged")
     try:
         value = _described(folder, kind)
         provenance = dict(value.get("provenance") or {})
         settings = dict(provenance.get("settings") or {})
-        counts = {name: float(value[name]) for name in ("episodes", "rows") if isinstance(value.get(name), int)}
-        scores = {name: float(number) for name, number in dict(provenance.get("validation") or {}).items()}
+        figures = {name: float(value[name]) for name in ("episodes", "rows") if isinstance(value.get(name), int)}
+        for name, number in dict(provenance.get("validation") or {}).items():
+            figures[name] = float(number)
+        sha256 = str(value.get("sha256") or (sha256_of(_description(folder, kind)) if value else ""))
+        state = "complete" if value or (folder / WEIGHTS).is_file() else "begun"  # copied weights have no description
+        if (folder / LOG).is_file():
+            rows = list(csv.DictReader(read_text(folder / LOG).splitlines()))
+            steps, step = int(settings.get("train", {}).get("steps", 0)), float(rows[-1]["step"]) if rows else 0.0
+            state = "complete" if step >= steps else f"step {step:.0f} of {steps}"
+        if value.get("kind") == "datastore":
+            sha256 = content_of(value["key"], value["chunk"], value["target"], value["files"])
         return replace(
             run,
-            state=_trained_state(folder, settings) if run.is_training else "complete" if value else "begun",
+            state=state,
             methods=(kind,),
             tasks=tuple(settings.get("task") or value.get("tasks") or ()),
             episodes=int(value.get("episodes", 0)) if kind == "demos" else 0,
-            figures=counts | scores,
+            figures=figures,
             command=tuple(str(provenance.get("command", "")).split()[1:]),
-            sha256=_hash_of(_description(folder, kind), value),
+            sha256=sha256,
             made_from=_made_from(value, provenance),
         )
     except (KervError, OSError, ValueError, TypeError, AttributeError, KeyError, csv.Error):
         return run
-
-
-def _hash_of(path: Path, value: Mapping[str, Any]) -> str:
-    """Return the hash of an artifact's weights or data. If the description names none, return the description's hash.
-
-    Args:
-        path: File of the description.
-        value: Contents of that file.
-    """
-    if value.get("kind") == "datastore":
-        return content_of(value["key"], value["chunk"], value["target"], value["files"])
-    return str(value.get("sha256") or (sha256_of(path) if value else ""))
-
-
-def _trained_state(folder: Path, settings: Mapping[str, Any]) -> str:
-    if not (folder / LOG).is_file():
-        return "complete"  # weights that were copied or imported have no log
-    rows = list(csv.DictReader(io.StringIO(read_text(folder / LOG))))
-    steps, step = int(settings.get("train", {}).get("steps", 0)), float(rows[-1]["step"]) if rows else 0.0
-    return "complete" if step >= steps else f"step {step:.0f} of {steps}"
 
 
 def _made_from(value: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[str, str]:
@@ -389,7 +370,7 @@ def parents(run: RunEntry, runs: Sequence[RunEntry]) -> dict[str, str]:
     The name is the id of another entry, or `shipped` and the name of a policy that kerv ships. For any other artifact,
     the name is the first 12 digits of its hash.
     """
-    names = {other.sha256: other.id for other in runs if other.sha256}
+    names = {other.sha256: other.id for other in runs}
     for folder in visible(shipped_dir()):
         for kind in artifact_kinds():
             with contextlib.suppress(KervError):
@@ -404,7 +385,7 @@ def children(run: RunEntry, runs: Sequence[RunEntry]) -> list[RunEntry]:
 
 def disk_bytes(folder: Path) -> int:
     """Return the total size of all files in a folder, in bytes."""
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+    return sum(map(os.path.getsize, filter(Path.is_file, folder.rglob("*"))))
 
 
 def labels_in(database: Database) -> dict[str, dict[str, str]]:
@@ -416,7 +397,7 @@ def labels_in(database: Database) -> dict[str, dict[str, str]]:
 
 def set_labels(database: Database, run: str, labels: Mapping[str, str]) -> None:
     """Replace the labels of a run, given its id. Empty labels are removed."""
-    kept = {kind: text for kind, text in labels.items() if text}
+    kept = dict(filter(itemgetter(1), labels.items()))
     with database.writing() as connection:
         connection.execute(sa.delete(ABOUT).where(ABOUT.c.key == _ABOUT + run))
         if kept:
@@ -473,8 +454,8 @@ def plan_of(run: RunEntry, database: Database) -> Study:
 
     results, study = str(database.results), store_of(run, database).load()
     new = {setting.label: checked(setting, study.tasks, results) for setting in study.settings}
-    episodes = tuple(Episode(new[one.setting.label], one.task, one.seed, one.repeat) for one in study.episodes)
-    study = dataclasses.replace(study, settings=tuple(new.values()), episodes=episodes)
+    episodes = [replace(one, setting=new[one.setting.label]) for one in study.episodes]
+    study = replace(study, settings=tuple(new.values()), episodes=tuple(episodes))
     # the same command resumes an interrupted repetition
     command = ["runs", "rerun", run.id, *([] if results == CommandSettings().results else [f"results={results}"])]
     row = interrupted(database, study.kind, command)
@@ -487,4 +468,4 @@ def plan_of(run: RunEntry, database: Database) -> Study:
         while Study(database, name).exists:
             number += 1
             name = f"{run.id}-again{number}"
-    return dataclasses.replace(study, name=name).plan(ALL, row.started if row else "", command=command)
+    return replace(study, name=name).plan(ALL, row.started if row else "", command=command)

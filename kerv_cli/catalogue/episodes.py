@@ -11,27 +11,12 @@ import sqlalchemy as sa
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.engine.record import DecodeRecord
-from kerv_cli.episodes.identity import Setting
 from kerv_cli.lab.database import BLOCKS, EPISODES, SETTINGS, STUDIES, WANTED, Database, measures_in
 from kerv_cli.lab.plan import Episode
 from kerv_cli.lab.store import Study, setting_of
 
 LARGEST_ID = 2**31 - 1
 """Largest row number that PostgreSQL stores."""
-
-
-def settings_in(store: Study) -> tuple[str, dict[str, Setting]]:
-    """Return the label of a study's baseline, and all settings of the study by label, in the study's order.
-
-    Raises:
-        UsageError: There is no such study.
-    """
-    with store.database.reading() as connection:
-        row = connection.execute(sa.select(STUDIES).where(STUDIES.c.name == store.name)).first()
-        if row is None:
-            raise UsageError(f"no study '{store.name}' in {store.database.shown}")
-        query = sa.select(SETTINGS).where(SETTINGS.c.study_id == row.id).order_by(SETTINGS.c.position)
-        return row.about["baseline"], {one.label: setting_of(one) for one in connection.execute(query)}
 
 
 def outcomes(store: Study, task: str = "", seed: int | None = None) -> list[Any]:

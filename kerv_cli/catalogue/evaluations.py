@@ -7,8 +7,6 @@ A vla-eval recording is a SQLite file. If a kerv server decoded the episodes, th
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import functools
 import hashlib
 import itertools
 import json
@@ -16,7 +14,7 @@ import math
 import re
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, astuple, dataclass
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -137,10 +135,7 @@ def import_evaluations(
     baseline = baseline or ("ar" if "ar" in by_label else next(iter(by_label)))
     if baseline not in by_label:
         raise UsageError(f"baseline={baseline}: the recordings are of {', '.join(by_label)}")
-    settings: list[Setting] = []
-    episodes: list[Episode] = []
-    existing: list[tuple[Episode, Evaluation, RecordedEpisode]] = []
-    notes: list[str] = []
+    settings, episodes, existing, notes = [], [], [], list[str]()
     for label, of_path in by_label.items():
         setting = Setting(label, "", _settings(of_path[0]), _identity(of_path))
         settings.append(setting)
@@ -153,7 +148,7 @@ def import_evaluations(
     title = f"{HARNESS}: {', '.join(benchmarks)}"
     about = title, baseline, "", "; ".join(notes)
     study = Study(database, name, IMPORT, tuple(settings), tuple(episodes), *about)
-    study.add(itertools.starmap(functools.partial(_imported, database.results), existing), words)
+    study.add((_imported(database.results, *one) for one in existing), words)
     return name, notes
 
 
@@ -171,7 +166,7 @@ def read_evaluations(path: Path) -> list[Evaluation]:
     for file in files:
         try:
             with contextlib.closing(connect_foreign(file)) as recording:
-                for name, metadata in recording.execute("SELECT eval_id, metadata FROM eval_metadata").fetchall():
+                for name, metadata in recording.execute("SELECT eval_id, metadata FROM eval_metadata"):
                     evaluation = _evaluation(recording, file, name, metadata)
                     evaluations += [evaluation] if evaluation.episodes else []
         except _DAMAGE as error:
@@ -180,7 +175,8 @@ def read_evaluations(path: Path) -> list[Evaluation]:
     if not evaluations:
         raise UsageError(f"{path}: the recording holds no episode")
     benchmarks = set(map(attrgetter("benchmark"), evaluations))
-    if len(benchmarks) < len(evaluations) or any(one.server != evaluations[0].server for one in evaluations):
+    servers = list(map(attrgetter("server"), evaluations))
+    if len(benchmarks) < len(evaluations) or servers.count(servers[0]) < len(servers):
         raise UsageError(f"{path} holds several evaluations of a benchmark, or of several servers: name each file")
     return evaluations
 
@@ -239,12 +235,15 @@ def labelled(recordings: Sequence[list[Evaluation]], labels: Sequence[str] = ())
 
 def _check_same_episodes(names: str, first: Sequence[Evaluation], other: Sequence[Evaluation]) -> None:
     name_of, world_of = attrgetter("benchmark"), attrgetter("task", "seed")
-    shared = [(a, b) for a, b in itertools.product(first, other) if a.benchmark == b.benchmark]
-    if not shared:
-        ours, theirs = ", ".join(map(name_of, first)), ", ".join(map(name_of, other))
+    of_other = dict(zip(map(name_of, other), other, strict=True))
+    if of_other.keys().isdisjoint(map(name_of, first)):
+        ours, theirs = ", ".join(map(name_of, first)), ", ".join(of_other)
         raise UsageError(f"{names} have different benchmarks: {ours} and {theirs}")
     has_pairs = False
-    for a, b in shared:
+    for a in first:
+        b = of_other.get(a.benchmark)
+        if b is None:
+            continue
         left, right = _conditions(a.config), _conditions(b.config)
         for key in sorted(left.keys() | right.keys()):
             if left.get(key) != right.get(key):
@@ -301,11 +300,11 @@ def _settings(first: Evaluation) -> dict[str, Any]:
     A kerv server sends its settings. For any other server they are the defaults, with the server's name as method.
     """
     stored = first.facts.get("settings")
-    plain = dataclasses.asdict(RolloutSettings()) | {"method": first.name}
+    plain = asdict(RolloutSettings()) | {"method": first.name}
     if isinstance(stored, dict):
         plain |= stored
         with contextlib.suppress(KervError):  # a part that is not registered here
-            plain = dataclasses.asdict(read_settings(RolloutSettings, stored))
+            plain = asdict(read_settings(RolloutSettings, stored))
     if str(first.config.get("benchmark", "")).startswith("kerv_cli."):
         params, world = dict(first.config.get("params") or {}), plain["world"]
         world["horizon"] = params.get("horizon", world["horizon"])
@@ -320,10 +319,12 @@ def _identity(evaluations: Sequence[Evaluation]) -> dict[str, str]:
 
     The hash of the results keeps rollouts from reusing imported episodes.
     """
-    recorded = [[one.id, list(map(dataclasses.astuple, one.episodes))] for one in evaluations]
+    recorded = [[one.id, list(map(astuple, one.episodes))] for one in evaluations]
     digest = hashlib.sha256(json.dumps(recorded, sort_keys=True).encode()).hexdigest()
-    hashes = {str(k): str(v) for k, v in dict(evaluations[0].facts.get("identity") or {}).items()}
-    return {"target": "", **hashes, "evaluation": digest, OBSERVATION: "of the benchmark"}
+    identity = {"target": ""}
+    for kind, sha256 in dict(evaluations[0].facts.get("identity") or {}).items():
+        identity[str(kind)] = str(sha256)
+    return identity | {"evaluation": digest, OBSERVATION: "of the benchmark"}
 
 
 def _imported(results: Path, episode: Episode, one: Evaluation, recorded: RecordedEpisode) -> ImportedEpisode:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
+import os
 import sqlite3
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import pyarrow as pa
 import sqlalchemy as sa
@@ -35,19 +34,9 @@ STEPS_PER_BYTE = 20
 _EVERY = 10_000
 
 
-@dataclass(frozen=True)
-class Found:
-    """A study that can be imported.
-
-    Attributes:
-        study: The study, with its settings and the list of all planned episodes.
-        episodes: Yields the episodes that were run, with their results.
-        command: Command-line arguments (without `kerv`) that ran it. Empty if unknown.
-    """
-
-    study: Study
-    episodes: Iterator[ImportedEpisode]
-    command: tuple[str, ...]
+Found: TypeAlias = tuple[Study, Iterator[ImportedEpisode], tuple[str, ...]]
+"""A study that can be imported, with the list of all planned episodes; its episodes that were run, with their results;
+and the command-line arguments (without `kerv`) that ran it, empty if unknown."""
 
 
 def import_databases(database: Database, files: Sequence[Path], name: str = "") -> tuple[list[str], list[str]]:
@@ -67,8 +56,7 @@ def import_databases(database: Database, files: Sequence[Path], name: str = "") 
         UsageError: A file is `database` itself. Or `name` is given, and a file does not hold exactly one study.
         CheckpointError: A file is damaged, or was written by a newer version of kerv.
     """
-    names: list[str] = []
-    notes: list[str] = []
+    names, notes = list[str](), list[str]()
     for file in files:
         if database.file is not None and file.resolve() == database.file.resolve():
             raise UsageError(f"{file} is the database to import into: name another folder with results=")
@@ -76,12 +64,11 @@ def import_databases(database: Database, files: Sequence[Path], name: str = "") 
             found = _in_database(file, database, name, stack)
             if name and len(found) != 1:
                 raise UsageError(f"name={name}: {file} holds {len(found)} studies, and name= needs exactly one")
-            for one in found:
-                study = one.study
+            for study, episodes, command in found:
                 if study.counts()[0]:
                     notes.append(f"{study.name} exists and was left out: 'kerv runs rm {study.name}' removes it")
                 else:
-                    study.add(one.episodes, one.command or ("runs", "import", str(file)))
+                    study.add(episodes, command or ("runs", "import", str(file)))
                     names.append(study.name)
     return names, notes
 
@@ -98,7 +85,7 @@ def database_in(path: Path) -> Path | None:
     return file if file.is_file() and file.suffix == Path(FILE).suffix else None
 
 
-def connect_foreign(path: Path, **options: Any) -> sqlite3.Connection:
+def connect_foreign(path: Path) -> sqlite3.Connection:
     """Open a SQLite file from somebody else, read-only.
 
     A small file can contain an endless query. So a connection may execute only a limited number of SQLite's
@@ -106,7 +93,6 @@ def connect_foreign(path: Path, **options: Any) -> sqlite3.Connection:
 
     Args:
         path: The file.
-        options: Further arguments for `sqlite3.connect`.
 
     Raises:
         OSError: The file is missing or is not a regular file.
@@ -116,7 +102,7 @@ def connect_foreign(path: Path, **options: Any) -> sqlite3.Connection:
     log = path.with_name(f"{path.name}-wal")
     # if its writer was killed, the last rows are in the log, which a connection with immutable=1 would ignore
     immutable = "" if log.is_file() and log.stat().st_size else "&immutable=1"
-    connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro{immutable}", uri=True, **options)
+    connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro{immutable}", uri=True, check_same_thread=False)
     left = (MOST_STEPS + STEPS_PER_BYTE * size) // _EVERY
 
     def count() -> bool:
@@ -147,41 +133,40 @@ def _in_database(path: Path, database: Database, name: str, stack: contextlib.Ex
     Raises:
         CheckpointError: The file is damaged, or was written by a newer version of kerv.
     """
-    engine = sa.create_engine(
-        "sqlite://", creator=lambda: connect_foreign(path, check_same_thread=False), poolclass=sa.pool.NullPool
-    )
+    engine = sa.create_engine("sqlite://", creator=lambda: connect_foreign(path), poolclass=sa.pool.NullPool)
     with _damage(path):
         connection = stack.enter_context(engine.connect())
         about = tables.ABOUT.c
         version = int(connection.scalar(sa.select(about.value).where(about.key == "schema_version")) or 0)
         if version > SCHEMA:
             raise newer(path, version)
-        found = []
-        for row in connection.execute(sa.select(tables.STUDIES)).all():
-            study = _stored(connection, row, database, name)
-            found.append(dataclasses.replace(study, episodes=_checked(path, study.episodes)))
-    return found
+        studies = connection.execute(sa.select(tables.STUDIES)).all()
+        return [_stored(connection, path, row, database, name) for row in studies]
 
 
-def _stored(connection: sa.Connection, row: Any, database: Database, name: str = "") -> Found:
-    """Return the study that a row of the table `studies` describes. It will be in `database`, with the name `name`."""
+def _stored(connection: sa.Connection, path: Path, row: Any, database: Database, name: str = "") -> Found:
+    """Return the study that a row of the table `studies` in the file `path` describes.
+
+    It will be in `database`, with the name `name`.
+    """
     settings, episodes = stored_settings(connection, row.id)
     study = Study(database, name or row.name, row.kind, tuple(settings.values()), episodes, **row.about)
     runs = tables.RUNS.c
     newest = sa.select(runs.command).where(runs.kind == row.kind, runs.name == row.name)
     command = connection.scalar(newest.order_by(runs.started.desc(), runs.id.desc()).limit(1))
-    return Found(study, _stored_episodes(connection, settings), tuple(command or ()))
+    return study, _stored_episodes(connection, path, settings), tuple(command or ())
 
 
-def _stored_episodes(connection: sa.Connection, settings: dict[int, Setting]) -> Iterator[ImportedEpisode]:
+def _stored_episodes(connection: sa.Connection, path: Path, settings: dict[int, Setting]) -> Iterator[ImportedEpisode]:
     """Yield the stored episodes of some settings.
 
     Args:
         connection: The database.
+        path: Its file, for the message.
         settings: The settings by their id in this database.
 
     Raises:
-        ValueError: The decodes of an episode are damaged or too large.
+        CheckpointError: The file is damaged, or the decodes of an episode are too large.
     """
     blocks, decodes = tables.BLOCKS.c, tables.DECODES
     of_block = blocks.id.label("block"), blocks.about, blocks.run, blocks.seeds, blocks.code
@@ -194,16 +179,13 @@ def _stored_episodes(connection: sa.Connection, settings: dict[int, Setting]) ->
         .where(tables.WANTED.c.setting_id.in_(settings))
         .order_by(tables.WANTED.c.position)
     )
-    for row in connection.execution_options(yield_per=100).execute(query).mappings():
-        episode = Episode(settings[row["setting_id"]], row["task"], row["seed"], row["repeat"])
-        values = {name: row[f"row.{name}"] for name in _ROW}
-        table = foreign_table(row["parquet"]).cast(DECODE_SCHEMA)
-        yield ImportedEpisode(episode, values, table, row["block"], row["about"], row["run"], row["seeds"], row["code"])
-
-
-def _checked(path: Path, episodes: Iterator[ImportedEpisode]) -> Iterator[ImportedEpisode]:
     with _damage(path):
-        yield from episodes
+        for row in connection.execution_options(yield_per=100).execute(query).mappings():
+            episode = Episode(settings[row["setting_id"]], row["task"], row["seed"], row["repeat"])
+            values = {name: row[f"row.{name}"] for name in _ROW}
+            decoded = foreign_table(row["parquet"]).cast(DECODE_SCHEMA)
+            block = row["block"], row["about"], row["run"], row["seeds"], row["code"]
+            yield ImportedEpisode(episode, values, decoded, *block)
 
 
 @contextlib.contextmanager
@@ -227,11 +209,11 @@ def export_database(study: Study, folder: Path) -> Path:
         copy = Database(new, file_url(new))
         with study.database.reading() as connection:
             row = connection.execute(sa.select(tables.STUDIES).where(tables.STUDIES.c.name == study.name)).one()
-            found = _stored(connection, row, copy)
-            found.study.add(found.episodes, found.command)
+            copied, episodes, command = _stored(connection, folder / FILE, row, copy)
+            copied.add(episodes, command)
         copy.close()
 
-    if folder.is_dir() and any(path.name != FILE for path in folder.iterdir()):
+    if folder.is_dir() and set(os.listdir(folder)) - {FILE}:
         raise UsageError(f"{folder} holds other files: choose another folder with --dir")
     write_folder(folder, fill)
     return folder / FILE
