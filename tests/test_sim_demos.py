@@ -19,7 +19,7 @@ from kerv_cli.targets.compact.features import WordTokenizer
 from kerv_cli.targets.observations import Observations, read_observations
 from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset, DemoManifest
-from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames, StreamedFrames, load_episode, save_episode
+from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames, load_episode, save_episode
 from kerv_cli.worlds.demos.recording import DemoConfig, Perturbation, is_perturbed, record
 from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.settings import CameraSettings
@@ -203,7 +203,7 @@ def test_an_episode_is_written_image_by_image(tmp_path):
     """A long episode of large images would otherwise take more memory than a robot's computer has."""
     made = replace(episode(tmp_path / "whole", 0), frame_steps=np.arange(60))
     pixels = np.random.default_rng(0).integers(0, 255, (SIZE, SIZE, 3), dtype=np.uint8)
-    streamed: Any = StreamedFrames((60, SIZE, SIZE, 3), (np.roll(pixels, shift, 0) for shift in range(60)))
+    streamed: Any = (np.roll(pixels, shift, 0) for shift in range(60))
     tracemalloc.start()
     try:
         save_episode(tmp_path / "long", replace(made, frames=streamed))

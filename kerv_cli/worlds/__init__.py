@@ -100,9 +100,11 @@ def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
     environments = specs().values()
     tasks: dict[str, str] = {}  # full name -> environment
     for name in names:
-        matches = {full: spec.name for spec in environments for full in spec.expand(name)}
+        matches: dict[str, str] = {}
+        for spec in environments:
+            matches |= dict.fromkeys(spec.expand(name), spec.name)
         if not matches:
-            raise UnknownName("task or suite", name, [n for spec in environments for n in (*spec.suites, *spec.tasks)])
+            raise UnknownName("task or suite", name, task_names())
         tasks |= matches
     owners = list(dict.fromkeys(tasks.values()))
     if len(owners) > 1:

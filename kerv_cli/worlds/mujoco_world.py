@@ -7,6 +7,7 @@ exist in one process. The module also finds an OpenGL backend that works on this
 from __future__ import annotations
 
 import atexit
+import contextlib
 import functools
 import os
 import subprocess
@@ -80,12 +81,8 @@ context.make_current()
 context.free()
 """
 _PROBE_SECONDS = 60.0
-
-
-def install_command() -> str:
-    """Return the shell command that installs two software OpenGL backends (EGL and OSMesa) on Debian and Ubuntu."""
-    sudo = "" if os.geteuid() == 0 else "sudo "
-    return f"{sudo}apt-get install -y libegl1 libosmesa6 libgl1-mesa-dri libgl1"
+_INSTALL = f"{'' if os.geteuid() == 0 else 'sudo '}apt-get install -y libegl1 libosmesa6 libgl1-mesa-dri libgl1"
+"""Command that installs two software OpenGL backends (EGL and OSMesa) on Debian and Ubuntu."""
 
 
 def choose_backend() -> str:
@@ -122,7 +119,7 @@ def find_backend() -> tuple[str, str]:
             return "", "mujoco was imported before a GL backend was chosen: set MUJOCO_GL=egl"
         backend = next(filter(_draws, _HEADLESS), "")
         if not backend:
-            return "", f"no OpenGL backend can draw here: {install_command()}"
+            return "", f"no OpenGL backend can draw here: {_INSTALL}"
         os.environ["MUJOCO_GL"] = backend
     if backend in _HEADLESS:
         os.environ["PYOPENGL_PLATFORM"] = backend
@@ -133,11 +130,10 @@ def _draws(backend: str) -> bool:
     """Return whether a backend can draw here. The attempt runs in a process of its own."""
     environment = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
     command = [sys.executable, "-c", _PROBE]
-    try:
+    with contextlib.suppress(subprocess.SubprocessError):
         subprocess.run(command, env=environment, capture_output=True, timeout=_PROBE_SECONDS, check=True)
-    except subprocess.SubprocessError:
-        return False
-    return True
+        return True
+    return False
 
 
 def load_mujoco() -> None:
@@ -176,12 +172,14 @@ class Camera:
         model.vis.quality.shadowsize = 0
         model.vis.global_.offwidth = max(int(model.vis.global_.offwidth), pixels)
         model.vis.global_.offheight = max(int(model.vis.global_.offheight), pixels)
+
+        class Renderer(mujoco.Renderer):
+            _gl_context = _mjr_context = None  # the destructor reads them, even if the constructor failed
+
         try:
-            self._renderer = _open_renderer(model, pixels)
+            self._renderer = Renderer(model, height=pixels, width=pixels)
         except Exception as error:  # each backend raises its own types
-            raise RenderingUnavailable(
-                f"OpenGL backend '{backend}' cannot draw here ({error}): {install_command()}"
-            ) from error
+            raise RenderingUnavailable(f"OpenGL backend '{backend}' cannot draw here ({error}): {_INSTALL}") from error
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         self._pixels = np.empty((pixels, pixels, 3), dtype=np.uint8)
@@ -203,15 +201,6 @@ class Camera:
         """Free the graphics context. A second call does nothing."""
         atexit.unregister(self.close)
         self._renderer.close()
-
-
-def _open_renderer(model: mujoco.MjModel, pixels: int) -> mujoco.Renderer:
-    import mujoco
-
-    class Renderer(mujoco.Renderer):
-        _gl_context = _mjr_context = None  # the destructor reads them, even if the constructor failed
-
-    return Renderer(model, height=pixels, width=pixels)
 
 
 def box_average(pixels: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:

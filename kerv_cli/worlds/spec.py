@@ -249,8 +249,7 @@ class EnvironmentSpec:
                 recorded dataset.
         """
         self.check_installed()
-        world: World = load(self.world_class)(self, task, camera, horizon)
-        return world
+        return load(self.world_class)(self, task, camera, horizon)
 
     def expert(self, task: str) -> Expert:
         """Return the scripted expert of a task.
@@ -261,8 +260,7 @@ class EnvironmentSpec:
         """
         if not self.expert_class:
             raise UsageError(f"{self.name} has no scripted experts: record demonstrations with its own tools")
-        expert: Expert = load(self.expert_class)(self, task)
-        return expert
+        return load(self.expert_class)(self, task)
 
 
 class World(ABC):

@@ -135,8 +135,7 @@ def build(settings: StressSettings) -> Stress:
     """
     if not settings.active:
         return NO_STRESS
-    stress: Stress = StressPart.find(settings.kind).built(settings.level)
-    return stress
+    return StressPart.find(settings.kind).built(settings.level)
 
 
 def factor_or_inverse(random: np.random.Generator, factor: float) -> float:
@@ -144,15 +143,15 @@ def factor_or_inverse(random: np.random.Generator, factor: float) -> float:
     return factor if random.random() < 0.5 else 1.0 / factor
 
 
-def robot_roots(model: Model) -> set[int]:
+def robot_roots(model: Model) -> list[int]:
     """Return the ids of the robots' root bodies. A root is a robot's if an actuator moves it or a body below it."""
     import mujoco
 
     joints = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-    roots = set()
+    roots = []
     for kind, (target, _) in zip(model.actuator_trntype, model.actuator_trnid, strict=True):
         body = model.jnt_bodyid[target] if kind in joints else model.site_bodyid[target]
-        roots.add(int(model.body_rootid[body]))
+        roots.append(int(model.body_rootid[body]))
     return roots
 
 
@@ -206,7 +205,8 @@ class Colour(Stress):
         share, random = self.amount, self.generator()
         changes.keep(model.geom_rgba)
         scenery = scenery_of(model)
-        colours = {body: random.random(3) for body in sorted({int(model.geom_bodyid[geom]) for geom in scenery})}
+        bodies = np.unique(model.geom_bodyid[scenery]).tolist()
+        colours = dict(zip(bodies, random.random((len(bodies), 3)), strict=True))
         for geom in scenery:
             material = model.geom_matid[geom]
             from_material = material >= 0 and np.allclose(model.geom_rgba[geom], _FROM_MATERIAL)
@@ -249,13 +249,9 @@ def scenery_of(model: Model) -> list[int]:
     """Return the ids of the geoms (shapes) of the scenery: background and table."""
     import mujoco
 
-    robots, plane = robot_roots(model), mujoco.mjtGeom.mjGEOM_PLANE
-
-    def fixed(body: int) -> bool:
-        return model.body_weldid[body] == 0 and model.body_mocapid[body] < 0 and model.body_rootid[body] not in robots
-
-    large = [g for g in range(model.ngeom) if model.geom_type[g] == plane or model.geom_rbound[g] >= WIDE]
-    return [g for g in large if fixed(int(model.geom_bodyid[g]))]
+    large = (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) | (model.geom_rbound >= WIDE)
+    fixed = (model.body_weldid == 0) & (model.body_mocapid < 0) & ~np.isin(model.body_rootid, robot_roots(model))
+    return np.flatnonzero(large & fixed[model.geom_bodyid]).tolist()
 
 
 @StressPart("object", requires=("model", "range"))
@@ -307,8 +303,8 @@ class Objects(Stress):
 
 def objects(model: Model) -> list[int]:
     """Return the ids of the bodies that have their own joints and do not belong to a robot."""
-    robots = robot_roots(model)
-    return [b for b in range(1, model.nbody) if model.body_dofnum[b] > 0 and model.body_rootid[b] not in robots]
+    is_object = (model.body_dofnum > 0) & ~np.isin(model.body_rootid, robot_roots(model))
+    return np.flatnonzero(is_object).tolist()
 
 
 def _is_free_and_primitive(model: Model, body: int) -> bool:

@@ -17,7 +17,6 @@ from vla_eval.specs import IMAGE_RGB, LANGUAGE, POSITION_DELTA, DimSpec
 from kerv_cli.base.spaces import Observation
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.settings import EVALUATION_SEED, CameraSettings, StressSettings
-from kerv_cli.worlds.spec import World
 from kerv_cli.worlds.stress import build as build_stress
 
 
@@ -77,7 +76,7 @@ class MetaWorld(StepBenchmark):
         settings = StressSettings(stress, stress_level)
         self.spec.check_stress(settings)
         self.stress, self.send_images, self.privileged = build_stress(settings), send_images, privileged
-        self.world: World | None = None
+        self.world: Any = None  # a World from the first reset on
 
     def get_tasks(self) -> list[dict[str, Any]]:
         """Return the tasks. Each task's suite is the task's difficulty group."""
@@ -101,7 +100,6 @@ class MetaWorld(StepBenchmark):
         Raises:
             KervError: The action is not 4 finite numbers, or the episode has ended.
         """
-        assert self.world is not None
         numbers = np.asarray(action.get("actions", action.get("action")), dtype=np.float64)
         observation, world = self.world.step(numbers), self.world
         self._recorder.record_step(success=world.succeeded, action=numbers, state=observation.proprioception)
@@ -109,7 +107,6 @@ class MetaWorld(StepBenchmark):
 
     def make_obs(self, raw_obs: Observation, task: dict[str, Any]) -> dict[str, Any]:
         """Return the observation in the form that is sent to the model server."""
-        assert self.world is not None
         images = self.world.observe([self.camera.name]).images if self.send_images else {}
         state = raw_obs.state if self.privileged else raw_obs.proprioception
         return {"images": images, "task_description": self.world.instruction, "state": state}
@@ -117,7 +114,6 @@ class MetaWorld(StepBenchmark):
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
         """Return the success so far, the episode's seed and initial state, and the end effector's position."""
         world = self.world
-        assert world is not None
         places = {"initial_state": world.initial_state.tolist(), "end_effector": world.end_effector.tolist()}
         return {"success": bool(world.succeeded), "seed": self._seed(self._task), **places}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from kerv_cli.base.files import read_mapping, sha256_of
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.worlds import EnvironmentPart, Task, stands_for_tasks
-from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames, load_episode
+from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames, load_episode, save_episode
 from kerv_cli.worlds.spec import EnvironmentSpec
 
 OnProgress = Callable[[int, int], object]
@@ -41,6 +42,13 @@ class EpisodeEntry:
     steps: int
     bytes: int
     sha256: str
+
+    @classmethod
+    def saved(cls, folder: Path, episode: DemoEpisode, level: int = 6) -> EpisodeEntry:
+        """Write an episode to its file in a dataset's folder, and return its entry. `save_episode` explains `level`."""
+        path = episode_path(folder, episode.task, episode.seed)
+        save_episode(path, episode, level)
+        return cls.of(path, episode)
 
     @classmethod
     def of(cls, path: Path, episode: DemoEpisode) -> EpisodeEntry:
@@ -173,7 +181,7 @@ def totals(
     tasks, seeds = {}, []
     for task, rows in entries.items():
         seeds += [entry.seed for entry in rows]
-        episodes = [asdict(entry) for entry in sorted(rows, key=lambda entry: entry.seed)]
+        episodes = [asdict(entry) for entry in sorted(rows, key=attrgetter("seed"))]
         mean = round(sum(entry.steps for entry in rows) / len(rows), 2)
         tasks[task] = {"mean_steps": mean, "failed_seeds": sorted(failed.get(task, ())), "episodes": episodes}
     return {
@@ -273,8 +281,7 @@ class DemoDataset:
                     raise CheckpointError(f"{part.path} has another {what} than {parts[0].path}: they cannot be joined")
         combined = hashlib.sha256("\n".join(part.sha256 for part in parts).encode()).hexdigest()
         config = {**first.config, "joined": [part.manifest.config for part in parts[1:]]}
-        episodes: list[DemoEntry] = []
-        tasks: dict[str, TaskEntry] = {}
+        episodes, tasks = list[DemoEntry](), dict[str, TaskEntry]()
         for part in parts:
             episodes += part.episodes
             tasks = part.manifest.tasks | tasks

@@ -47,7 +47,8 @@ class DemoEpisode:
         seed: Seed of the episode.
         perturbed: Whether noise was added to the executed actions, or an actor moved the robot instead of the expert.
         steps: T, the number of control steps.
-        frames: (n, size, size x views, 3) uint8, the recorded images.
+        frames: (n, size, size x views, 3) uint8, the recorded images. For an episode that is only saved: an iterator of
+            images.
         frame_steps: (n,) int64. Image i was drawn before the action of control step `frame_steps[i]`.
         states: (T, s) float32, privileged state before each action. It begins with the proprioception.
         labels: (T + tail, D) float32, the expert's actions for D DoFs, clipped and without noise. The expert executed
@@ -87,34 +88,40 @@ def save_episode(path: Path, episode: DemoEpisode, level: int = 6) -> None:
 
     Raises:
         StorageError: Writing failed.
+        ValueError: The images have different sizes.
     """
-    height, width = episode.frames.shape[1:3]
-    metadata = {
-        "format": FORMAT,
-        "task": episode.task,
-        "seed": str(episode.seed),
-        "perturbed": str(episode.perturbed).lower(),
-        "steps": str(episode.steps),
-        "frame_size": str(height),
-    }
-    if width != height:  # older files have no width, and equal episodes must have equal bytes
-        metadata["frame_width"] = str(width)
     with (
         atomic_path(path) as temporary,
         temporary.open("wb") as file,
         tempfile.TemporaryFile(dir=path.parent) as pictures,
     ):
-        sizes = [pictures.write(encode_png(frame, level)) for frame in episode.frames]
+        height, width, sizes = 0, 0, list[int]()
+        for frame in episode.frames:
+            height, width = frame.shape[:2] if not sizes else (height, width)
+            if frame.shape[:2] != (height, width):
+                found = f"{frame.shape[1]} x {frame.shape[0]}"
+                raise ValueError(f"an image has {found} pixels, the first of its episode {width} x {height}")
+            sizes.append(pictures.write(encode_png(frame, level)))
+        metadata = {
+            "format": FORMAT,
+            "frame_size": str(height),
+            "perturbed": str(episode.perturbed).lower(),
+            "seed": str(episode.seed),
+            "steps": str(episode.steps),
+            "task": episode.task,
+        }
+        if width != height:  # older files have no width, and equal episodes must have equal bytes
+            metadata["frame_width"] = str(width)
         tensors = {
-            "png": np.zeros(0, np.uint8),  # the pictures follow
+            "png": np.zeros(0, np.uint8),  # the pictures follow, because safetensors writes tensors of bytes last
             "png_offsets": np.cumsum([0, *sizes], dtype=np.int64),
             **{name: getattr(episode, name) for name in _ARRAYS},
             "rand_vec": episode.initial_state,
         }
         # Not safetensors' save_file: on a full disk it raises its own type of error.
         data = save(tensors, metadata=metadata)
-        header, start = header_of(data)
-        begin = len(data) - start  # safetensors writes tensors of bytes last
+        start = LENGTH.size + LENGTH.unpack(data[: LENGTH.size])[0]
+        header, begin = json.loads(data[LENGTH.size : start]), len(data) - start
         header["png"] |= {"shape": [sum(sizes)], "data_offsets": [begin, begin + sum(sizes)]}
         # safetensors writes the keys in random order, which would give equal recordings different hashes
         header["__metadata__"] = dict(sorted(metadata.items()))
@@ -139,10 +146,7 @@ def load_episode(path: Path) -> DemoEpisode:
             arrays = {name: file.get_tensor(name) for name in _ARRAYS}
             arrays["initial_state"] = file.get_tensor("rand_vec")
             offsets = file.get_tensor("png_offsets")
-        with path.open("rb") as data:
-            length = data.read(LENGTH.size)
-            header, begin = header_of(length + data.read(LENGTH.unpack(length)[0]))
-        positions = offsets + begin + header["png"]["data_offsets"][0]
+        positions = path.stat().st_size - offsets[-1] + offsets  # the pictures are at the end of the file
         spans = np.stack([np.zeros(len(positions) - 1, np.int64), positions[:-1], positions[1:]], axis=1)
         height = int(metadata["frame_size"])
         return DemoEpisode(
@@ -193,7 +197,7 @@ class EncodedFrames:
         return len(self.spans)
 
     def __iter__(self) -> Iterator[NDArray[np.uint8]]:
-        return (self[i] for i in range(len(self)))
+        return map(self._decode, range(len(self)))
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return self.pixels().astype(dtype or np.uint8, copy=False)
@@ -227,32 +231,6 @@ class EncodedFrames:
             data = file.read(end - start)
         with Image.open(io.BytesIO(data)) as image:
             return np.array(image)[:, : self.width]  # a copy, because torch warns if memory is read-only
-
-
-@dataclass(frozen=True)
-class StreamedFrames:
-    """Images that are decoded one after the other, while their episode is saved. They can be read once.
-
-    Attributes:
-        shape: Shape of the decoded images, (n, height, width, 3).
-        images: Yields the decoded images, (height, width, 3) uint8.
-    """
-
-    shape: tuple[int, int, int, int]
-    images: Iterator[NDArray[np.uint8]]
-
-    def __iter__(self) -> Iterator[NDArray[np.uint8]]:
-        return self.images
-
-
-def header_of(data: bytes) -> tuple[dict[str, Any], int]:
-    """Return the header of a safetensors file, and the position at which its arrays begin.
-
-    Args:
-        data: Bytes of the file, at least up to the end of the header.
-    """
-    begin = LENGTH.size + LENGTH.unpack(data[: LENGTH.size])[0]
-    return json.loads(data[LENGTH.size : begin]), begin
 
 
 def encode_png(frame: NDArray[np.uint8], level: int = 6) -> bytes:

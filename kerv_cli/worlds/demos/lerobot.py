@@ -28,16 +28,8 @@ from kerv_cli.base.files import read_mapping, regular, write_folder, write_json
 from kerv_cli.base.paths import as_path
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, action_limits
 from kerv_cli.worlds import EnvironmentPart
-from kerv_cli.worlds.demos.dataset import (
-    FORMAT,
-    DemoDataset,
-    EpisodeEntry,
-    OnProgress,
-    check_recorded,
-    episode_path,
-    totals,
-)
-from kerv_cli.worlds.demos.files import DemoEpisode, StreamedFrames, foreign_table, memory_limit, save_episode
+from kerv_cli.worlds.demos.dataset import FORMAT, DemoDataset, EpisodeEntry, OnProgress, check_recorded, totals
+from kerv_cli.worlds.demos.files import DemoEpisode, foreign_table, memory_limit
 from kerv_cli.worlds.settings import DemosImportSettings
 from kerv_cli.worlds.spec import EnvironmentSpec
 
@@ -192,8 +184,8 @@ class Source:
         """Return the path of the data file of an episode, see `path`."""
         return self.path(episode, "data", self.info.get("data_path") or DATA)
 
-    def frames(self, episode: Row, table: pa.Table) -> StreamedFrames:
-        """Return the images (T, height, width, 3) uint8 of one episode.
+    def frames(self, episode: Row, table: pa.Table) -> Iterator[np.ndarray]:
+        """Return the T images (height, width, 3) uint8 of one episode. They are decoded one after the other.
 
         Args:
             episode: The episode's row in meta/episodes.
@@ -219,7 +211,7 @@ class Source:
                 f"{path}: the {count} images of an episode take {size // 2**20} MiB in memory, with the episodes "
                 f"before {self.taken[path] // 2**20}; at most {most // 2**20} MiB are read from a file of this size"
             )
-        return StreamedFrames((count, *first.shape), _alike(first, images, path))
+        return itertools.chain([first], images)
 
 
 def allowed(path: Path, ratio: int) -> int:
@@ -264,10 +256,8 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
     environment = re.sub(r"\W+", "_", settings.name or source.folder.name).strip("_").lower() or "recorded"
     if world is None:
         check_recorded(environment)
-    entries: dict[str, list[EpisodeEntry]] = {}
-    limits: list[np.ndarray] = []
-    state, done = 0, 0
-    of_files: dict[Path, list[Row]] = {}
+    entries, of_files = dict[str, list[EpisodeEntry]](), dict[Path, list[Row]]()
+    limits, state, done = list[np.ndarray](), 0, 0
     for row in chosen:
         of_files.setdefault(source.data_path(row), []).append(row)
     for path, rows in of_files.items():
@@ -280,12 +270,12 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
     for path, rows in of_files.items():
         table = _table(path, ["episode_index", "task_index", *VECTORS, source.key], allowed(path, ROWS_RATIO))
         for row in rows:
-            episode = _episode(source, row, path, table, names, settings.tail)
+            with _reading(path):
+                episode = _episode(source, row, path, table, names, settings.tail)
+                entry = EpisodeEntry.saved(folder, episode, level=1)  # a small file may hold many pixels
+            entries.setdefault(episode.task, []).append(entry)
             limits += [episode.executed.min(0), episode.executed.max(0)]
             state, done = episode.states.shape[1], done + 1
-            saved = episode_path(folder, episode.task, episode.seed)
-            save_episode(saved, episode, level=1)  # a small file may hold many pixels
-            entries.setdefault(episode.task, []).append(EpisodeEntry.of(saved, episode))
             progress(done, len(chosen))
     proprioception = tuple(source.names(STATE, "state")[:state])
     if world:
@@ -295,7 +285,7 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
         space = action_space(source, settings, np.array(limits))
         observation = ObservationSpace(proprioception, state, (), (0.0, 0.0, 0.0))
         instructions = {names[i]: text for i, text in source.tasks.items() if names[i] in entries}
-    recording = {
+    manifest = {
         "format": FORMAT,
         "environment": world.name if world else environment,
         "config": {
@@ -305,16 +295,13 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
             "tail": settings.tail,
             "tasks": list(entries),
         },
-    }
-    manifest = {
-        **recording,
         "actions": space.as_dict(),
         "observation": asdict(observation),
         "versions": {"lerobot": str(source.info["codebase_version"])},
         **totals(entries, {}, missing=0),
         "instructions": instructions,
     }
-    write_json(folder / "recording.json", recording)
+    write_json(folder / "recording.json", {key: manifest[key] for key in ("format", "environment", "config")})
     write_json(folder / "manifest.json", manifest)
 
 
@@ -352,11 +339,9 @@ def _observation(source: Source, state: int, world: EnvironmentSpec) -> Observat
     Raises:
         CheckpointError: `state` is the size of neither the whole state nor the proprioception.
     """
-    whole = world.observation
-    alone = whole.without_state()
-    for space in (whole, alone):
-        if space.state == state:
-            return space
+    whole, alone = world.observation, world.observation.without_state()
+    if state in (whole.state, alone.state):
+        return whole if state == whole.state else alone
     raise CheckpointError(
         f"{source.folder} has {state} numbers of state, {world.name} has {alone.state} of proprioception "
         f"({STATE}) and {whole.state} in all ({ENVIRONMENT})"
@@ -378,18 +363,17 @@ def _episode(source: Source, row: Row, path: Path, table: pa.Table, names: Mappi
         CheckpointError: Rows are missing, a file is damaged or too large, or a number is not finite.
     """
     number, length = int(row["episode_index"]), int(row["length"])
-    with _reading(path):
-        table = table.filter(pc.equal(table["episode_index"], number))
-        if not 0 < len(table) == length:
-            raise CheckpointError(f"{path} has {len(table)} rows of episode {number}, not its length")
-        columns = {name: _vectors(table, name) for name in VECTORS if name in table.column_names}
-        task = names[int(table["task_index"][0].as_py())]
+    table = table.filter(pc.equal(table["episode_index"], number))
+    if not 0 < len(table) == length:
+        raise CheckpointError(f"{path} has {len(table)} rows of episode {number}, not its length")
+    columns = {name: _vectors(table, name) for name in VECTORS if name in table.column_names}
+    task = names[int(table["task_index"][0].as_py())]
     for values in columns.values():
         if not np.isfinite(values).all():
             raise CheckpointError(f"{path}: episode {number} holds numbers that are not finite")
     labels = columns[ACTION]
     states = columns.get(ENVIRONMENT, columns.get(STATE, np.zeros((length, 0), np.float32)))
-    frames: Any = source.frames(row, table)  # `save_episode` reads them once
+    frames: Any = source.frames(row, table)
     return DemoEpisode(
         task=task,
         seed=number,
@@ -463,8 +447,7 @@ def _task_names(tasks: Mapping[int, str], world: EnvironmentSpec | None) -> dict
             if text not in known:
                 raise UsageError(f"environment={world.name}: it has no task with the instruction '{text}'")
         return {number: known[text] for number, text in tasks.items()}
-    names: dict[int, str] = {}
-    taken: set[str] = set()
+    names, taken = dict[int, str](), set[str]()
     for number, text in tasks.items():
         name = re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60] or f"task-{number}"
         names[number] = name if name not in taken else f"{name}-{number}"
@@ -515,18 +498,15 @@ def _vectors(table: pa.Table, name: str) -> np.ndarray:
     Raises:
         ValueError: The rows have different lengths, or more than MOST_NUMBERS numbers.
     """
-    parts = []
-    for part in filter(len, table[name].chunks):
-        rows = len(part)
-        while pa.types.is_nested(part.type):
-            lengths = pc.unique(pc.list_value_length(part)).to_pylist()
-            if len(lengths) > 1 or None in lengths:
-                raise ValueError(f"the rows of {name} have different lengths")
-            part = part.flatten()
-        if len(part) > MOST_NUMBERS * rows:
-            raise ValueError(f"{name} has {len(part) // rows} numbers per row, at most {MOST_NUMBERS} are read")
-        parts.append(part.to_numpy(zero_copy_only=False).astype(np.float32).reshape(rows, -1))
-    return np.concatenate(parts)
+    part, rows = table[name].combine_chunks(), len(table)
+    while pa.types.is_nested(part.type):
+        lengths = pc.unique(pc.list_value_length(part)).to_pylist()
+        if len(lengths) > 1 or None in lengths:
+            raise ValueError(f"the rows of {name} have different lengths")
+        part = part.flatten()
+    if len(part) > MOST_NUMBERS * rows:
+        raise ValueError(f"{name} has {len(part) // rows} numbers per row, at most {MOST_NUMBERS} are read")
+    return part.to_numpy(zero_copy_only=False).astype(np.float32).reshape(rows, -1)
 
 
 def _pictures(cells: pa.ChunkedArray, folder: Path, path: Path) -> Iterator[np.ndarray]:
@@ -548,21 +528,6 @@ def _pictures(cells: pa.ChunkedArray, folder: Path, path: Path) -> Iterator[np.n
         place = path if data else _below(folder, str(value.get("path")))
         with _reading(place), Image.open(io.BytesIO(data) if data else regular(place)) as image:
             yield np.asarray(image.convert("RGB"))
-
-
-def _alike(first: np.ndarray, others: Iterator[np.ndarray], path: Path) -> Iterator[np.ndarray]:
-    """Yield the images of an episode, which are in the file `path`.
-
-    Raises:
-        CheckpointError: An image has another size than the first.
-    """
-    height, width, _ = first.shape
-    with _reading(path):
-        for image in itertools.chain([first], others):
-            if image.shape != first.shape:
-                size = f"{image.shape[1]} x {image.shape[0]}"
-                raise ValueError(f"an image has {size} pixels, the first of its episode {width} x {height}")
-            yield image
 
 
 def _video_frames(path: Path, start: float, rate: float, count: int) -> Iterator[np.ndarray]:

@@ -34,7 +34,7 @@ from kerv_cli.base.processes import Workers
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.demos.dataset import FORMAT, DemoManifest, EpisodeEntry, OnProgress, episode_path, totals
-from kerv_cli.worlds.demos.files import DemoEpisode, load_episode, save_episode
+from kerv_cli.worlds.demos.files import DemoEpisode, load_episode
 from kerv_cli.worlds.mujoco_world import choose_backend
 from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import EnvironmentSpec, World
@@ -326,8 +326,7 @@ def _record_seeds(
                 perturbed = is_perturbed(seed, config.perturbed)
                 write_json(failure, {"task": world.task, "seed": seed, "perturbed": perturbed})
             else:
-                save_episode(path, recorded)
-                outcomes[seed] = EpisodeEntry.of(path, recorded)
+                outcomes[seed] = EpisodeEntry.saved(out, recorded)
     return task, outcomes
 
 

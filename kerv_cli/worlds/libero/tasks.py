@@ -14,13 +14,12 @@ _WHERE = (
     "next to the plate",
     "on the wooden cabinet",
 )
-INSTRUCTIONS = {
-    f"bowl-{where.replace(' the', '').replace('the ', '').replace(' ', '-')}": (
-        f"pick up the black bowl {where} and place it on the plate"
-    )
-    for where in _WHERE
-}
+INSTRUCTIONS: dict[str, str] = {}
 """Name of a task -> its instruction."""
+
+for _place in _WHERE:
+    _name = _place.replace(" the", "").replace("the ", "").replace(" ", "-")
+    INSTRUCTIONS[f"bowl-{_name}"] = f"pick up the black bowl {_place} and place it on the plate"
 
 SUITE = "LIBERO_SPATIAL"
 NAMES = (SUITE, *INSTRUCTIONS)

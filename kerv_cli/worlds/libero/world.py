@@ -53,8 +53,7 @@ def check_packages() -> None:
         if owner != PACKAGE:
             again = f"pip install --force-reinstall --no-deps {PACKAGE}=={version(PACKAGE)}"
             raise UsageError(f"{owner} has the import name libero, too: pip uninstall -y {owner} && {again}")
-    needs = [Requirement(line) for line in (*(requires(PACKAGE) or ()), "mujoco==3.3.0")]
-    for need in needs:
+    for need in map(Requirement, (*(requires(PACKAGE) or ()), "mujoco==3.3.0")):
         if need.marker is not None and not need.marker.evaluate({"extra": ""}):
             continue
         try:

@@ -15,11 +15,13 @@ from kerv_cli.worlds import Task
 
 SUFFIX = "-v3"
 
-with Path(__file__).with_name("tasks.csv").open(encoding="utf-8") as _file:
-    _rows = sorted((f"{row['task']}{SUFFIX}", row["instruction"], row["difficulty"]) for row in csv.DictReader(_file))
-
-TASKS: Mapping[str, Task] = {row[0]: Task(*row) for row in _rows}
+TASKS: dict[str, Task] = {}
 """Full name -> task, all 50 in alphabetical order."""
+
+with Path(__file__).with_name("tasks.csv").open(encoding="utf-8") as _file:
+    for _row in csv.DictReader(_file):
+        _name = f"{_row['task']}{SUFFIX}"
+        TASKS[_name] = Task(_name, _row["instruction"], _row["difficulty"])
 
 _MT10 = (
     "reach push pick-place door-open drawer-open drawer-close button-press-topdown peg-insert-side window-open "
