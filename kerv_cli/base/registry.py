@@ -274,7 +274,6 @@ class ThresholdPart(Part):
     batchable: bool = False
 
 
-@dataclass(frozen=True)
 class RectifierPart(Part):
     """A rectifier, which completes a chunk after a rejection."""
 
@@ -311,7 +310,6 @@ class SkipPart(Part):
     batchable: bool = False
 
 
-@dataclass(frozen=True)
 class SearchPart(Part):
     """A search through a datastore. Its class is an `Index` (`kerv_cli/methods/heisd/__init__.py`)."""
 
@@ -344,7 +342,6 @@ class ArtifactPart(Part):
         return self.code()()
 
 
-@dataclass(frozen=True)
 class ColumnPart(Part):
     """A column of tables. The decorated function maps a data frame, the episodes of one setting, to a number."""
 

@@ -38,7 +38,6 @@ def find(what: str, check: Callable[[], str]) -> Finding:
     """
     try:
         return Finding(what, True, check())
-    except KervError as error:
-        return Finding(what, False, str(error))
     except Exception as error:  # noqa: BLE001 - the code under test is anybody's
-        return Finding(what, False, f"raises {type(error).__name__}: {' '.join(str(error).split())[:200]}")
+        raised = f"raises {type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        return Finding(what, False, str(error) if isinstance(error, KervError) else raised)
