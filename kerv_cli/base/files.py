@@ -69,7 +69,7 @@ def _temporary(path: Path) -> Iterator[Path]:
     try:
         with storage_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
-            clean_once(path.parent)
+            _clean_once(path.parent)
             yield temporary
             sync(path.parent)
     finally:
@@ -355,10 +355,8 @@ def clean(folder: Path) -> list[Path]:
     return sorted(paths)
 
 
-@functools.cache
-def clean_once(folder: Path) -> None:
-    """Clean a folder with `clean`. Later calls of this process do nothing."""
-    clean(folder)
+_clean_once = functools.cache(clean)
+"""Clean a folder. Later calls of this process do nothing."""
 
 
 def remove(path: Path) -> None:
