@@ -6,6 +6,7 @@ method drafts, or it is read from a published table. Nothing is run, and this mo
 
 from __future__ import annotations
 
+import bisect
 import csv
 import functools
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +19,7 @@ from kerv_cli.base.registry import DRAFTING
 from kerv_cli.engine.cost import Profile
 
 _TOP = 8  # children of a node, and kept nodes of a level, in EAGLE-2's tree
-_STEPS = 20  # halvings of an interval until a search ends
+_STEPS = 2**20  # probabilities that a search distinguishes
 
 
 @dataclass(frozen=True)
@@ -184,13 +185,7 @@ def _least(enough: Callable[[float], bool]) -> float:
 
     If `enough` is true for a probability, it must be true for all larger ones.
     """
-    if enough(0.0):
-        return 0.0
-    low, high = 0.0, 1.0
-    for _ in range(_STEPS):
-        middle = (low + high) / 2
-        low, high = (low, middle) if enough(middle) else (middle, high)
-    return high
+    return bisect.bisect_left(range(_STEPS), True, key=lambda step: enough(step / _STEPS)) / _STEPS
 
 
 TABLES = {"papers": 4, "papers_libero": 7, "main": 16}

@@ -188,13 +188,8 @@ def closest(table: Iterable[Recorded], family: Family) -> Recorded | None:
     If several settings have the method, return the first that drafts as the family does (chain or tree). If none of
     them does, return the first.
     """
-    found = None
-    for one in table:
-        if one.method == family.method:
-            found = found or one
-            if bool(one.drafts.nodes) == bool(family.drafts.nodes):
-                return one
-    return found
+    of_method = filter(lambda one: one.method == family.method, table)
+    return max(of_method, key=lambda one: bool(one.drafts.nodes) == bool(family.drafts.nodes), default=None)
 
 
 @dataclass(frozen=True)

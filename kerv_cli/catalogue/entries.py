@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import fnmatch
+import itertools
 import json
 import os
 import re
@@ -464,8 +465,7 @@ def plan_of(run: RunEntry, database: Database) -> Study:
     elif study.kind == ROLLOUT:
         name = new_name(study)
     else:
-        number, name = 1, f"{run.id}-again"
+        numbers, name = itertools.count(2), f"{run.id}-again"
         while Study(database, name).exists:
-            number += 1
-            name = f"{run.id}-again{number}"
+            name = f"{run.id}-again{next(numbers)}"
     return replace(study, name=name).plan(ALL, row.started if row else "", command=command)

@@ -222,10 +222,9 @@ def labelled(recordings: Sequence[list[Evaluation]], labels: Sequence[str] = ())
     by_label: dict[str, list[Evaluation]] = {}
     for position, evaluations in enumerate(recordings):
         label = name = labels[position] if labels else evaluations[0].name
-        number = 1
+        numbers = itertools.count(2)
         while label in by_label:
-            number += 1
-            label = f"{name}-{number}"
+            label = f"{name}-{next(numbers)}"
         by_label[label] = evaluations
     first, *others = by_label
     for other in others:

@@ -103,14 +103,8 @@ def connect_foreign(path: Path) -> sqlite3.Connection:
     # if its writer was killed, the last rows are in the log, which a connection with immutable=1 would ignore
     immutable = "" if log.is_file() and log.stat().st_size else "&immutable=1"
     connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro{immutable}", uri=True, check_same_thread=False)
-    left = (MOST_STEPS + STEPS_PER_BYTE * size) // _EVERY
-
-    def count() -> bool:
-        nonlocal left
-        left -= 1
-        return left < 0
-
-    connection.set_progress_handler(count, _EVERY)
+    ticks = iter(range((MOST_STEPS + STEPS_PER_BYTE * size) // _EVERY))
+    connection.set_progress_handler(lambda: next(ticks, None) is None, _EVERY)
     try:
         pages = connection.execute("PRAGMA page_count").fetchone()[0]
         if immutable and size < pages * connection.execute("PRAGMA page_size").fetchone()[0]:

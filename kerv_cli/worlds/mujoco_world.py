@@ -50,7 +50,7 @@ class MujocoWorld(World):
 
     def reset(self, seed: int) -> Observation:
         """Start the episode of a seed: restore the model, reset the simulator, then apply the stress to the model."""
-        self._changes.restore()
+        self._changes.close()
         observation = super().reset(seed)
         self.stress.change(self._drawable()[0], self._changes)
         return observation
@@ -63,7 +63,7 @@ class MujocoWorld(World):
 
     def close(self) -> None:
         """Restore the model and free the graphics contexts."""
-        self._changes.restore()
+        self._changes.close()
         for camera in self._cameras.values():
             camera.close()
         self._cameras.clear()

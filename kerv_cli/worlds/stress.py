@@ -5,6 +5,7 @@ Kinds of stress change the model (light, colour, camera, objects), actions (push
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
@@ -37,21 +38,13 @@ class StressPart(Part):
     requires: tuple[str, ...]
 
 
-class ModelChanges:
-    """Remembers the original values of the arrays of a MuJoCo model that a stress changes."""
-
-    def __init__(self) -> None:
-        self._originals: list[tuple[NDArray[Any], NDArray[Any]]] = []
+class ModelChanges(ExitStack):
+    """Remembers the original values of arrays of a MuJoCo model. `close` restores them, the last change first."""
 
     def keep(self, *arrays: NDArray[Any]) -> None:
         """Remember the current values of some arrays of a model. Call it before changing them."""
-        self._originals.extend((array, array.copy()) for array in arrays)
-
-    def restore(self) -> None:
-        """Restore the original values of all arrays, the last change first."""
-        while self._originals:
-            array, values = self._originals.pop()
-            array[...] = values
+        for array in arrays:
+            self.callback(np.copyto, array, array.copy())
 
 
 class Stress:
