@@ -115,10 +115,9 @@ class Part:
             UsageError: A part of the same kind and name, but with other code, is registered already.
         """
         same = _PARTS.setdefault(self.kind, {})
-        if self.name in same and same[self.name].origin != self.origin:
-            raise UsageError(
-                f"{self.kind} '{self.name}' is registered twice: {same[self.name].origin} and {self.origin}"
-            )
+        known = same.get(self.name, self)
+        if known.origin != self.origin:
+            raise UsageError(f"{self.kind} '{self.name}' is registered twice: {known.origin} and {self.origin}")
         same[self.name] = self
 
     @classmethod

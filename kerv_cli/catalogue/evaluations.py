@@ -259,9 +259,7 @@ def _conditions(config: Mapping[str, Any]) -> dict[str, Any]:
     return flat({key: config.get(key) for key in ("benchmark", "mode", "max_steps", "params")})
 
 
-def _episodes(
-    setting: Setting, one: Evaluation, names_benchmark: bool
-) -> Iterator[tuple[Episode, RecordedEpisode | None]]:
+def _episodes(setting: Setting, one: Evaluation, several: bool) -> Iterator[tuple[Episode, RecordedEpisode | None]]:
     """Yield the planned episodes of an evaluation, each with its recorded result.
 
     The result is None if the episode is missing or ended in an error.
@@ -269,7 +267,7 @@ def _episodes(
     Args:
         setting: The setting of the evaluation.
         one: The evaluation.
-        names_benchmark: Whether to put the benchmark's name before the task's.
+        several: Whether several benchmarks are imported. The name of each then comes before its tasks' names.
     """
     each = int(one.config.get("episodes_per_task") or 0)
     by_task: dict[str, list[RecordedEpisode]] = {}
@@ -278,7 +276,7 @@ def _episodes(
     for task, episodes in by_task.items():
         good = {e.seed: e for e in sorted(episodes, key=attrgetter("seed")) if not e.reason}
         offset = episodes[0].seed - episodes[0].index if not episodes[0].reason else 0
-        name = f"{one.benchmark}: {task}" if names_benchmark else task
+        name = f"{one.benchmark}: {task}" if several else task
         for seed in dict.fromkeys([*good, *range(offset, offset + each)]):
             yield Episode(setting, name, seed), good.get(seed)
 

@@ -297,12 +297,10 @@ class DemoDataset:
         Raises:
             CheckpointError: The file has changed since it was recorded.
         """
-        entry = self.episodes[index]
-        if sha256_of(entry.path) != entry.sha256:
-            raise CheckpointError(
-                f"{entry.path} changed since it was recorded: move it aside and run 'kerv demos' again"
-            )
-        episode = load_episode(entry.path)
+        entry, path = self.episodes[index], self.episodes[index].path
+        if sha256_of(path) != entry.sha256:
+            raise CheckpointError(f"{path} changed since it was recorded: move it aside and run 'kerv demos' again")
+        episode = load_episode(path)
         frames = episode.frames
         if not self.views or not isinstance(frames, EncodedFrames):
             return episode

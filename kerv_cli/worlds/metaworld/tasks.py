@@ -8,7 +8,6 @@ position: the tables have other orders.
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
 from pathlib import Path
 
 from kerv_cli.worlds import Task
@@ -28,10 +27,7 @@ _MT10 = (
     "window-close"
 )
 
-SUITES: Mapping[str, tuple[str, ...]] = {
-    "MT10": tuple(f"{task}{SUFFIX}" for task in _MT10.split()),
-    "MT50": tuple(TASKS),
-}
+SUITES = {"MT10": tuple(f"{task}{SUFFIX}" for task in _MT10.split()), "MT50": tuple(TASKS)}
 """Name of a suite -> full names of its tasks."""
 
 NAMES = (*SUITES, *TASKS)
