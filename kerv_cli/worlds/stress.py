@@ -5,6 +5,7 @@ Kinds of stress change the model (light, colour, camera, objects), actions (push
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
@@ -333,28 +334,25 @@ PUSH_SECONDS = 0.1
 STUCK_SECONDS = 0.25
 
 
-class Bursts:
-    """Bursts of a fixed duration that begin at random, one at a time.
+def bursts(
+    random: np.random.Generator, per_second: float, seconds: float, control_hz: float
+) -> Iterator[tuple[bool, bool]]:
+    """Yield for each control step whether a burst runs in it, and whether it begins in it.
+
+    Bursts have a fixed duration and begin at random, one at a time.
 
     Args:
+        random: Draws when a burst begins, once per control step without one.
         per_second: Mean number of bursts that begin per second while no burst is running.
         seconds: Duration of a burst.
         control_hz: Control steps per second.
     """
-
-    def __init__(self, per_second: float, seconds: float, control_hz: float) -> None:
-        self._steps = max(1, round(seconds * control_hz))
-        self._chance = min(1.0, per_second / control_hz)
-        self._left = 0
-
-    def next_step(self, random: np.random.Generator) -> tuple[bool, bool]:
-        """Return whether a burst runs in this control step, and whether it begins in this step."""
-        begins = self._left == 0 and bool(random.random() < self._chance)
-        if begins:
-            self._left = self._steps
-        runs = self._left > 0
-        self._left -= runs
-        return runs, begins
+    left = 0
+    while True:
+        begins = left == 0 and bool(random.random() < min(1.0, per_second / control_hz))
+        left = max(1, round(seconds * control_hz)) if begins else left
+        yield left > 0, begins
+        left = max(left - 1, 0)
 
 
 @StressPart("push", requires=("actions", "position"))
@@ -371,14 +369,14 @@ class Push(Stress):
         """Prepare the random numbers of an episode."""
         super().begin(task, seed, space)
         self._random = self.generator()
-        self._bursts = Bursts(self.amount, PUSH_SECONDS, space.control_hz)
+        self._bursts = bursts(self._random, self.amount, PUSH_SECONDS, space.control_hz)
         self._position = space.dofs_of("position")
         self._half, self._middle = space.half[self._position], space.middle[self._position]
         self._push = self._middle
 
     def act(self, action: Array, step: int) -> Array:
         """Return the action; while the hand is being pushed, its position part is replaced by the push."""
-        runs, begins = self._bursts.next_step(self._random)
+        runs, begins = next(self._bursts)
         if begins:
             self._push = self._middle + unit_vector(self._random, len(self._half)) * self._half
         if not runs:
@@ -412,13 +410,13 @@ class Actuation(Stress):
         self._low, self._high = np.array(space.low)[self._loose], np.array(space.high)[self._loose]
         self._half, self._middle = space.half[self._loose], space.middle[self._loose]
         self._gain = 1.0 + self._random.uniform(-gain, gain, len(self._half))
-        self._bursts = Bursts(stuck, STUCK_SECONDS, space.control_hz)
+        self._bursts = bursts(self._random, stuck, STUCK_SECONDS, space.control_hz)
         self._stuck = 0
 
     def act(self, action: Array, step: int) -> Array:
         """Apply gains and noise to the action. A stuck DoF does not move."""
         noise = self._random.normal(0.0, self._noise, len(self._half)) * self._half
-        runs, begins = self._bursts.next_step(self._random)
+        runs, begins = next(self._bursts)
         if begins:
             self._stuck = int(self._random.integers(len(self._half)))
         moved = self._middle + (action[self._loose] - self._middle) * self._gain + noise

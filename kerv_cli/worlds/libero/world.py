@@ -16,7 +16,6 @@ import functools
 import logging
 import math
 import warnings
-from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
 from pathlib import Path
 from typing import Any
@@ -62,16 +61,6 @@ def check_packages() -> None:
             raise UsageError(f"LIBERO needs the package {need.name}: pip install '{need}'") from None
         if not need.specifier.contains(found, prereleases=True):
             raise UsageError(f"LIBERO does not run with {need.name} {found}: pip install '{need}'")
-
-
-@contextlib.contextmanager
-def _private_random() -> Iterator[None]:
-    """Restore numpy's global random state at the end of the `with` block, because LIBERO changes it."""
-    state = np.random.get_state()  # noqa: NPY002
-    try:
-        yield
-    finally:
-        np.random.set_state(state)  # noqa: NPY002
 
 
 class Libero(MujocoWorld):
@@ -122,7 +111,8 @@ class Libero(MujocoWorld):
         self._model.geom_group[self._model.geom_group == 0] = 3  # shapes for collisions, which must not be drawn
 
     def _start(self, seed: int) -> NDArray[np.float64]:
-        with _private_random():
+        with contextlib.ExitStack() as stack:
+            stack.callback(np.random.set_state, np.random.get_state())  # noqa: NPY002 - because LIBERO changes it
             if self._env is None:
                 self._build()
             evaluated = seed in self.spec.seeds.evaluation
