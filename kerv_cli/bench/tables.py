@@ -119,10 +119,7 @@ def _numbers(answers: Iterable[Answer], name: str, none: str = "–") -> str:
     texts = []
     for answer in answers:
         value = getattr(answer, name)
-        if value is None:
-            texts.append(none)
-        else:
-            texts.append(f"{value:.2f}" if value < 10 else f"{value:.1f}")
+        texts.append(none if value is None else f"{value:.2f}" if value < 10 else f"{value:.1f}")
     return _beside(texts)
 
 
