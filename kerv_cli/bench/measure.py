@@ -268,8 +268,8 @@ def costs_of(
 
 def phases_of(
     seconds: Mapping[Key, Sequence[float]], sizes: Sizes, machine: Machine, drafts: Mapping[Key, tuple[float, float]]
-) -> list[Phase]:
-    """Summarise measured times as phases, in the order of a decode.
+) -> Iterator[Phase]:
+    """Summarise measured times as phases, and yield these in the order of a decode.
 
     Args:
         seconds: Seconds of each repeat, by the kind and rows of the phase.
@@ -279,14 +279,13 @@ def phases_of(
             network makes the draft.
     """
     order = (*FORWARDS, *source_methods())
-    phases, prompt = [], min(rows for kind, rows in seconds if kind == "prefill")
+    prompt = min(rows for kind, rows in seconds if kind == "prefill")
     for kind, rows in sorted(seconds, key=lambda key: (order.index(key[0]), key[1])):
         read, flops = drafts.get((kind, rows)) or sizes.needs(kind, rows, prompt)
         times = seconds[kind, rows]
         median, p95 = np.percentile(times, [50, 95])
         floor = max(machine.bounds(read, flops))
-        phases.append(Phase(kind, rows, float(median), float(p95), float(min(times)), read, flops, floor))
-    return phases
+        yield Phase(kind, rows, float(median), float(p95), float(min(times)), read, flops, floor)
 
 
 def profile_of(phases: Sequence[Phase], tokens: int) -> Profile:
@@ -435,4 +434,4 @@ def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Ma
                 seconds.setdefault(key, []).append(value)
     machine = machine.best_of(measure_machine(device, model.dtype))
     drafts = {(kind, 1): needs_of_draft(source) for kind, source in sources.items()}
-    return machine, phases_of(seconds, model.sizes, machine, drafts)
+    return machine, list(phases_of(seconds, model.sizes, machine, drafts))

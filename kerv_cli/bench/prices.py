@@ -66,9 +66,9 @@ ACTION = 7
 """Number of tokens of one action of OpenVLA. Published lengths and times are for chunks of one action."""
 
 
-def computed(policy: Described, device: Device) -> list[NamedProfile]:
-    """Return the costs of a policy on a device: one profile for each engine, with the engine's name."""
-    shape, encoder, costs = policy.shape, policy.encoder, []
+def computed(policy: Described, device: Device) -> Iterator[NamedProfile]:
+    """Yield the costs of a policy on a device: one profile for each engine, with the engine's name."""
+    shape, encoder = policy.shape, policy.encoder
     assert shape is not None
     for engine in ENGINES.values():
         profile, bounds = priced(shape, device, engine), {}
@@ -79,8 +79,7 @@ def computed(policy: Described, device: Device) -> list[NamedProfile]:
             bounds["encode"] = "given"
         elif not profile.seconds("encode", 1):
             bounds["encode"] = "none"
-        costs.append(NamedProfile(engine.name, profile, bounds))
-    return costs
+        yield NamedProfile(engine.name, profile, bounds)
 
 
 def costs_of(settings: EstimateSettings, policy: Described | None) -> Iterator[tuple[str, NamedProfile]]:

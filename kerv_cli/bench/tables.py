@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -19,28 +19,24 @@ Row = dict[str, str]
 """Cells of a row by the names of their columns."""
 
 
-def card_rows(card: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return rows (name, value): sizes of the model, rates of the device, and shortest times of forwards.
+def card_rows(card: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield rows (name, value): sizes of the model, rates of the device, and shortest times of forwards.
 
     Args:
         card: Result of `measure.card_of`.
     """
-    rows = [
-        ("weights that a forward reads", f"{card['weights'] / 1e6:.1f} M, {card['weight_bytes'] / 1e6:.1f} MB"),
-        ("cache of prompt and chunk", f"{card['cache_bytes'] / 1e6:.2f} MB"),
-        ("memory, measured", f"{card['bandwidth'] / 1e9:.1f} GB/s"),
-        ("memory that holds the weights, measured", f"{card['bandwidth_of_weights'] / 1e9:.1f} GB/s"),
-        ("arithmetic, measured", f"{card['flops'] / 1e9:.0f} GFLOP/s"),
-    ]
+    yield "weights that a forward reads", f"{card['weights'] / 1e6:.1f} M, {card['weight_bytes'] / 1e6:.1f} MB"
+    yield "cache of prompt and chunk", f"{card['cache_bytes'] / 1e6:.2f} MB"
+    yield "memory, measured", f"{card['bandwidth'] / 1e9:.1f} GB/s"
+    yield "memory that holds the weights, measured", f"{card['bandwidth_of_weights'] / 1e9:.1f} GB/s"
+    yield "arithmetic, measured", f"{card['flops'] / 1e9:.0f} GFLOP/s"
     for name, (reading, computing) in card["floors"].items():
         why = "to read the weights" if reading >= computing else "for the arithmetic"
-        rows.append((f"floor of {name}", f"{1e3 * max(reading, computing):.2f} ms, {why}"))
-    return rows
+        yield f"floor of {name}", f"{1e3 * max(reading, computing):.2f} ms, {why}"
 
 
-def phase_rows(phases: Sequence[Phase]) -> list[Row]:
-    """Return a row per measured phase. The floor is the shortest time that the device allows."""
-    rows = []
+def phase_rows(phases: Sequence[Phase]) -> Iterator[Row]:
+    """Yield a row per measured phase. The floor is the shortest time that the device allows."""
     for phase in phases:
         row = {"phase": phase.name}
         for name, seconds in (("median ms", phase.seconds), ("p95", phase.p95), ("least", phase.least)):
@@ -51,38 +47,32 @@ def phase_rows(phases: Sequence[Phase]) -> list[Row]:
             limits["GFLOP/s"] = f"{phase.flops / phase.seconds / 1e9:.0f}"
             limits["floor ms"] = f"{1e3 * phase.floor:.3f}"
             limits["least ÷ floor"] = f"{phase.least / phase.floor:.1f}"
-        rows.append(row | limits)
-    return rows
+        yield row | limits
 
 
-def projection_rows(computed: Iterable[Projection]) -> list[Row]:
-    """Return a row per computed profile."""
-    rows = []
+def projection_rows(computed: Iterable[Projection]) -> Iterator[Row]:
+    """Yield a row per computed profile."""
     for one in computed:
         row = {"profile": one.name, "device": one.device.title, "engine": one.engine.name}
         row["encoder ms"] = f"{1e3 * one.profile.seconds('encode', 1):.2f}"
         row["one token ms"] = f"{1e3 * one.profile.seconds('verify', 1):.2f}"
         row["seven tokens ms"] = f"{1e3 * one.profile.decode(ACTION):.2f}"
         row["floor ms"] = f"{1e3 * one.floors.decode(ACTION):.2f}"
-        rows.append(row)
-    return rows
+        yield row
 
 
-def anchor_rows() -> list[Row]:
-    """Return a row per published time of OpenVLA-7B, with the time that kerv computes."""
-    rows = []
+def anchor_rows() -> Iterator[Row]:
+    """Yield a row per published time of OpenVLA-7B, with the time that kerv computes."""
     for one in ANCHORS:
         row = {"device": DEVICES[one.device].title, "engine": one.engine.name}
         if one.weight < 1:
             row["engine"] += ", int4"
         row["published, ms"] = f"{one.low:g}" if one.low == one.high else f"{one.low:g}–{one.high:g}"
-        rows.append(row | {"ours, ms": f"{one.ours:.1f}", "source": one.source})
-    return rows
+        yield row | {"ours, ms": f"{one.ours:.1f}", "source": one.source}
 
 
-def part_rows(estimates: Sequence[Estimate]) -> list[Row]:
-    """Return one row per part of an autoregressive decode. Each cell lists the figures of all engines."""
-    rows = []
+def part_rows(estimates: Sequence[Estimate]) -> Iterator[Row]:
+    """Yield one row per part of an autoregressive decode. Each cell lists the figures of all engines."""
     for name in estimates[0].parts:
         taken, shares, bounds = [], [], []
         for one in estimates:
@@ -90,18 +80,17 @@ def part_rows(estimates: Sequence[Estimate]) -> list[Row]:
             taken.append(f"{1e3 * seconds:.3g}")
             shares.append(f"{100 * seconds / one.seconds:.0f} %")
             bounds.append(bound)
-        row = {"one action under AR": name, "ms": _beside(taken), "share": _beside(shares), "bound": _beside(bounds)}
-        rows.append(row)
+        cells = {"ms": _beside(taken), "share": _beside(shares), "bound": _beside(bounds)}
+        yield {"one action under AR": name} | cells
     whole = _beside([f"{1e3 * one.seconds:.3g}" for one in estimates])
-    return [*rows, {"one action under AR": "all", "ms": whole, "share": "", "bound": ""}]
+    yield {"one action under AR": "all", "ms": whole, "share": "", "bound": ""}
 
 
-def family_rows(estimates: Sequence[Estimate]) -> list[Row]:
-    """Return one row per family of methods. Each cell lists the figures of all engines."""
-    rows = []
+def family_rows(estimates: Sequence[Estimate]) -> Iterator[Row]:
+    """Yield one row per family of methods. Each cell lists the figures of all engines."""
     for answers in zip(*[one.answers for one in estimates], strict=True):
         first = answers[0]
-        row = {
+        yield {
             "family": first.family,
             "method": first.method,
             "ceiling": _numbers(answers, "ceiling"),
@@ -110,8 +99,6 @@ def family_rows(estimates: Sequence[Estimate]) -> list[Row]:
             "at kerv's": _numbers(answers, "at_own_acceptance"),
             "break-even": _numbers(answers, "break_even_tokens", "never" if first.is_verified else "–"),
         }
-        rows.append(row)
-    return rows
 
 
 def _numbers(answers: Iterable[Answer], name: str, none: str = "–") -> str:

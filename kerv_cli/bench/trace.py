@@ -6,7 +6,7 @@ A trace says which drafts were made and accepted, in a file that any program can
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from operator import attrgetter, itemgetter
@@ -177,10 +177,10 @@ def work_of_trace(decodes: Sequence[TracedDecode], tokens: int) -> Work:
     return work_of(columns, np.array(counts), phases, np.array(searched), tokens)
 
 
-def price(trace: Sequence[TracedDecode], costs: NamedProfile) -> list[dict[str, Any]]:
-    """Return what the decodes of each setting of a trace cost.
+def price(trace: Sequence[TracedDecode], costs: NamedProfile) -> Iterator[dict[str, Any]]:
+    """Yield what the decodes of each setting of a trace cost.
 
-    Returns:
+    Yields:
         One dictionary for each setting and chunk length. It holds the numbers of episodes and decodes, the milliseconds
         per decode and per episode, and the speed against AR decodes of chunks of the same length at the same costs. The
         95 % interval of the speed comes from resampling episodes. It is NaN for a single episode.
@@ -188,7 +188,6 @@ def price(trace: Sequence[TracedDecode], costs: NamedProfile) -> list[dict[str, 
     Raises:
         UsageError: The profile lacks a cost, or has costs for shorter chunks only.
     """
-    found = []
     for (name, tokens), decodes in grouped(trace).items():
         work = work_of_trace(decodes, tokens)
         costs.check(tokens, work.needs, name)
@@ -199,8 +198,7 @@ def price(trace: Sequence[TracedDecode], costs: NamedProfile) -> list[dict[str, 
         row = {"setting": name, "tokens": tokens, "episodes": len(counts), "decodes": len(decodes)}
         row["ms_per_decode"] = 1e3 * float(seconds.sum()) / len(decodes)
         row["ms_per_episode"] = 1e3 * float(seconds.sum()) / len(counts)
-        found.append(row | speed)
-    return found
+        yield row | speed
 
 
 def _ratio(one: np.ndarray, other: np.ndarray, chosen: np.ndarray) -> list[float]:

@@ -41,7 +41,7 @@ def bench(settings: BenchSettings, as_json: AsJson = False) -> None:
     machine = measure_machine(model.target.device, model.dtype)
     print_table(("card", ""), card_rows(card_of(model, machine)), f"{model.name}, {model.dtype}".replace("torch.", ""))
     machine, phases = measure(model, machine, settings)
-    print_rows(phase_rows(phases), title_of(model))
+    print_rows(list(phase_rows(phases)), title_of(model))
     result = document(model, machine, phases)
     _write(settings, f"{model.name.rstrip('/').rsplit('/', 1)[-1]}-{result['dtype']}", result)
     if as_json:
@@ -54,8 +54,8 @@ def _project(settings: BenchSettings, as_json: bool) -> None:
     from kerv_cli.bench.tables import anchor_rows, projection_rows
 
     computed = list(projections(settings))
-    print_rows(projection_rows(computed), f"{settings.projected}, computed, not measured")
-    print_rows(anchor_rows(), "one action of OpenVLA-7B, as published and as computed")
+    print_rows(list(projection_rows(computed)), f"{settings.projected}, computed, not measured")
+    print_rows(list(anchor_rows()), "one action of OpenVLA-7B, as published and as computed")
     for one in computed:
         _write(settings, f"{one.name}-profile", one.document)
     if as_json:

@@ -56,8 +56,8 @@ def estimate(settings: EstimateSettings, as_json: AsJson = False) -> None:
         if policy and policy.shape:
             engines = " / ".join(one.costs.name for one in estimates)
             title = f"{policy.shape.name} on {title}, computed, not measured: {engines}"
-        print_rows(part_rows(estimates), title)
-        print_rows(family_rows(estimates), "speed against AR; break-even: accepted tokens per verification")
+        print_rows(list(part_rows(estimates)), title)
+        print_rows(list(family_rows(estimates)), "speed against AR; break-even: accepted tokens per verification")
         for line in filter(None, (*row["notes"], row.get("rate"), row["sentence"])):
             typer.echo(line)
     if as_json:
