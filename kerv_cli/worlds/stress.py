@@ -137,16 +137,14 @@ def factor_or_inverse(random: np.random.Generator, factor: float) -> float:
     return factor if random.random() < 0.5 else 1.0 / factor
 
 
-def robot_roots(model: Model) -> list[int]:
-    """Return the ids of the robots' root bodies. A root is a robot's if an actuator moves it or a body below it."""
+def robot_roots(model: Model) -> Iterator[int]:
+    """Yield the ids of the robots' root bodies. A root is a robot's if an actuator moves it or a body below it."""
     import mujoco
 
     joints = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-    roots = []
     for kind, (target, _) in zip(model.actuator_trntype, model.actuator_trnid, strict=True):
         body = model.jnt_bodyid[target] if kind in joints else model.site_bodyid[target]
-        roots.append(int(model.body_rootid[body]))
-    return roots
+        yield int(model.body_rootid[body])
 
 
 WIDE = 0.35
@@ -244,7 +242,7 @@ def scenery_of(model: Model) -> list[int]:
     import mujoco
 
     large = (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) | (model.geom_rbound >= WIDE)
-    fixed = (model.body_weldid == 0) & (model.body_mocapid < 0) & ~np.isin(model.body_rootid, robot_roots(model))
+    fixed = (model.body_weldid == 0) & (model.body_mocapid < 0) & ~np.isin(model.body_rootid, list(robot_roots(model)))
     return np.flatnonzero(large & fixed[model.geom_bodyid]).tolist()
 
 
@@ -297,7 +295,7 @@ class Objects(Stress):
 
 def objects(model: Model) -> list[int]:
     """Return the ids of the bodies that have their own joints and do not belong to a robot."""
-    is_object = (model.body_dofnum > 0) & ~np.isin(model.body_rootid, robot_roots(model))
+    is_object = (model.body_dofnum > 0) & ~np.isin(model.body_rootid, list(robot_roots(model)))
     return np.flatnonzero(is_object).tolist()
 
 
