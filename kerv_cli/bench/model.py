@@ -56,7 +56,7 @@ class Model:
         """Sizes of the target, counted from its layers and its cache. An enlarged trunk counts with its new size."""
         target, drafter, cache = self.target, self.drafter, self.target.new_cache(1, 1)
         matrices = [x for x in (*target.layers.parameters(), *target.layers.buffers()) if x.dim() == 2]
-        weights, head = sum(x.numel() for x in matrices), target.width * target.actions.tokens
+        weights, head = sum(map(torch.numel, matrices)), target.width * target.actions.tokens
         return Sizes(
             layers=weights,
             head=head,
