@@ -17,7 +17,7 @@ from kerv_cli.methods.context import Context
 from kerv_cli.methods.motion import MotionRule
 from kerv_cli.methods.reuse import LookupProposer, LookupProposerSettings
 from kerv_cli.methods.settings import MethodSettings
-from kerv_cli.report.viewing.token_outcomes import chunk_size, outcomes_of, token_names
+from kerv_cli.report.viewing.token_outcomes import chunk_size, decode_table, outcomes_of, token_names
 
 RNG = np.random.default_rng(0)
 CHUNKS = np.cumsum(RNG.normal(0, 0.2, (400, 4, 7)), 1).clip(-1, 1)
@@ -130,7 +130,11 @@ def test_tokens_of_a_code_are_shown_by_their_place_alone():
     size = chunk_size(records, 1)
     assert size == max(len(record.tokens) for record in records)
     for record in records:
-        kinds = [outcome.kind for outcome in outcomes_of(record, size, 1)]
-        assert kinds == ["target"] * len(record.tokens) + ["dropped"] * (size - len(record.tokens))
+        outcomes = outcomes_of(record, size, 1)
+        kinds = [outcome.kind for outcome in outcomes]
+        assert kinds == ["target"] * len(record.tokens) + ["ended"] * (size - len(record.tokens))
+        *_, titles, _, rows = decode_table(record, 0, 0, outcomes, ["token"]).split("\n", 5)
+        assert titles == "| token | draft | target | r | kept | outcome |"
+        assert len(rows.splitlines()) == len(record.tokens)
     bins = Decoder(MockTarget(SEVEN, 4, seed=2)).decode(shown(1))
     assert token_names([bins], SEVEN.names) == SEVEN.names

@@ -42,6 +42,7 @@ OUTCOMES = {
     "skipped": OutcomeStyle("»", 0xF0E442FF, "executed without a verification"),
     "scripted": OutcomeStyle("=", 0x4E79A7FF, "an action of a scripted expert, without tokens"),
     "dropped": OutcomeStyle("–", 0x2E3238FF, "not executed: the rest of the chunk was dropped"),
+    "ended": OutcomeStyle(" ", 0x1B1E22FF, "no token: this chunk of a code has fewer"),
 }
 
 
@@ -110,14 +111,15 @@ def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome
     """Return the outcome of each token of a decode's chunk.
 
     A rejected token stays `rejected` even if a prediction replaced it later. All other tokens that were not executed
-    are `dropped`.
+    are `dropped`. Where a chunk of a code has ended there is no token: `ended`.
 
     Args:
         decode: The decode.
         size: N, tokens per chunk.
         dofs: D, tokens per control step.
     """
-    executed = len(decode.tokens) if _is_coded(decode, dofs) else len(decode.actions) * dofs
+    is_coded = _is_coded(decode, dofs)
+    executed = len(decode.tokens) if is_coded else len(decode.actions) * dofs
     unjudged = "skipped" if decode.skipped or not decode.forwards else "target"  # of tokens that appear in no round
     is_scripted = not (decode.skipped or decode.rounds or decode.tokens)
     outcomes = [TokenOutcome("scripted" if is_scripted else unjudged)] * size
@@ -141,7 +143,7 @@ def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome
             outcomes[index] = TokenOutcome("compensated")
     for index in range(executed, size):
         if outcomes[index].kind != "rejected":
-            outcomes[index] = replace(outcomes[index], kind="dropped")
+            outcomes[index] = TokenOutcome("ended") if is_coded else replace(outcomes[index], kind="dropped")
     for index, token in enumerate(decode.tokens[:size]):
         outcomes[index] = replace(outcomes[index], token=token)
     return outcomes
@@ -227,8 +229,9 @@ def decode_table(
         number: Number of the decode in the episode, from 0.
         step: Control step at which its first action is executed.
         outcomes: Outcome of each token of its chunk.
-        names: Names of the D DoFs.
+        names: Names of the D DoFs, or one name for tokens of a code, which belong to no step and DoF.
     """
+    is_coded = len(names) == 1
     counts = {
         "forwards": decode.forwards,
         "verifications": decode.verifications,
@@ -241,13 +244,16 @@ def decode_table(
         f"**Decode {number} at step {step}: {decode.mode}**  ",
         " · ".join(f"{name}: {value}" for name, value in counts.items() if value),
         "",
-        "| token | step | DoF | draft | target | r | kept | outcome |",
-        "|--:|--:|:--|--:|--:|--:|--:|:--|",
+        f"| token |{'' if is_coded else ' step | DoF |'} draft | target | r | kept | outcome |",
+        f"|--:|{'' if is_coded else '--:|:--|'}--:|--:|--:|--:|:--|",
     ]
     for index, outcome in enumerate(outcomes):
+        if outcome.kind == "ended":
+            continue
         step, dof = divmod(index, len(names))
         word = f"{OUTCOMES[outcome.kind].symbol} {outcome.kind}"
         word = f"**{word}**" if outcome.kind == "rejected" else word
-        cells = (index, step, names[dof], outcome.draft, outcome.target, outcome.limit, outcome.token, word)
+        place = [index] if is_coded else [index, step, names[dof]]
+        cells = (*place, outcome.draft, outcome.target, outcome.limit, outcome.token, word)
         lines.append(f"| {' | '.join(map(_text, cells))} |")
     return "\n".join(lines)
