@@ -213,7 +213,7 @@ def test_an_interrupted_rollout_goes_on_where_it_was(policies, tmp_path, monkeyp
     monkeypatch.setattr(EpisodeRunner, "__call__", interrupted)
     stopped = kerv(*command, code=130)
     assert "1 of 3 episodes of" in stopped.stderr
-    assert listed(tmp_path / "results")[0]["state"] == "1 of 3 episodes"
+    assert listed(tmp_path / "results")[0]["state"] == "interrupted, 1 of 3 episodes"
     last = 100_002
     stopped = kerv(*command, code=130)
     assert "1 of 3 episodes are there" in stopped.stderr

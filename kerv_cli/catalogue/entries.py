@@ -59,7 +59,7 @@ class RunEntry:
         kind: sweep, rollout, import, or a kind of artifact.
         folder: Folder of its files.
         started: Start time in UTC (ISO 8601). For an artifact, the time when its newest file changed.
-        state: For example `complete`, `2 of 6 episodes`, `step 300 of 600`, `begun` or `damaged`.
+        state: For example `complete`, `interrupted, 2 of 6 episodes`, `step 300 of 600`, `begun` or `damaged`.
         methods: Decoding methods of its settings. For an artifact, its kind.
         tasks: Names of its tasks.
         episodes: Number of its stored episodes.
@@ -164,7 +164,8 @@ def _with_command(entry: RunEntry, row: RunRow, is_finished: bool) -> RunEntry:
         return entry
     entry = replace(entry, left=time_left(row), message=row.message)
     if entry.has_episodes:
-        state = f"{RUNNING}, {entry.done} of {entry.total} episodes" if is_running else entry.state
+        is_open = is_running or COMPLETE not in (entry.state, row.status)
+        state = f"{row.status}, {entry.done} of {entry.total} episodes" if is_open else entry.state
         return replace(entry, started=entry.started if entry.episodes else row.started[:23], state=state)
     state = f"{row.status}, {row.done} of {row.total}" if row.total else row.status
     started = entry.started if is_repeat else row.started[:23]
