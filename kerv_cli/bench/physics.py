@@ -240,7 +240,7 @@ class Shape:
         sizes: Sizes of trunk, head and EAGLE's drafter.
         layers: Number of the trunk's layers.
         prompt: P, number of prompt tokens.
-        parts: Bytes and operations of each phase that runs at most once per decode, by kind of cost: `encode` (vision
+        parts: Needs of each phase that runs at most once per decode. The keys are kinds of phase: `encode` (vision
             towers and projector), `early`, `scout`, `retrieval`.
     """
 

@@ -174,11 +174,12 @@ def clusters_of(cells: Sequence[Cell]) -> list[tuple[list[Cell], int]]:
 
 
 def _asked(request: Request) -> tuple[list[Cell], dict[str, Any]]:
-    """Read a study's episodes for a page.
+    """Read the episodes of a study for one of its pages: all episodes, or the failures.
 
     Returns:
-        The episodes. If the address names a setting or a task, only its episodes. And values that the templates of both
-        pages show: `study`, `baseline`, `known` (all settings and tasks) and `chosen`.
+        cells: The episodes. Only those of the setting and task that the address names, if any.
+        values: Values for the templates of both pages: `study`, `baseline`, `known` (all settings and tasks) and
+            `chosen` (the setting and task that the address names).
 
     Raises:
         UnknownName: The study has no such setting or task.

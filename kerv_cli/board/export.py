@@ -1,8 +1,8 @@
 """Write the board's pages as files that a browser opens without a server, and that can be sent to a colleague.
 
-The pages come from the web app: this module asks it for each, without a server or a network. Links lead to
-the written files. A link to a page that is not exported becomes plain text. The templates leave out what works only
-with the server, such as forms and buttons (`live`).
+The web app renders the pages. This module calls the app directly, without a server or a network. Links lead to the
+written files. A link to a page that is not exported becomes plain text. The templates leave out what works only with
+a server, such as forms and buttons.
 """
 
 from __future__ import annotations

@@ -100,7 +100,7 @@ class RunEntry:
 
     @property
     def command_line(self) -> str:
-        """The command that made it, as it is typed. Empty if unknown."""
+        """The shell command that made the study or artifact. Empty if unknown."""
         return shlex.join(["kerv", *self.command]) if self.command else ""
 
     @property

@@ -139,9 +139,17 @@ def _in_database(path: Path, database: Database, name: str, stack: contextlib.Ex
 
 
 def _stored(connection: sa.Connection, path: Path, row: Any, database: Database, name: str = "") -> Found:
-    """Return the study that a row of the table `studies` in the file `path` describes.
+    """Read a study from a row of the table `studies`, and prepare its import into another database.
 
-    It will be in `database`, with the name `name`.
+    Args:
+        connection: The database that the row comes from.
+        path: File of that database, for error messages.
+        row: The row.
+        database: The database to import the study into.
+        name: Name of the study there. Empty: its own name.
+
+    Returns:
+        The study, its stored episodes and its command line, see `Found`.
     """
     settings, episodes = stored_settings(connection, row.id)
     study = Study(database, name or row.name, row.kind, tuple(settings.values()), episodes, **row.about)

@@ -217,7 +217,8 @@ def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None =
 def print_study(data: StudyData, all_columns: bool = False, how: str = "", explain: bool = False) -> None:
     """Print the table of a study and its note.
 
-    If times cannot be compared, because they were not measured in turn, print the command that measures them again.
+    A setting has no speedup if its episodes were not timed alternately with the baseline's. Name these settings, and
+    the command that times them again.
 
     Args:
         data: The study.

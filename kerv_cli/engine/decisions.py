@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Choice:
-    """Decision of a boundary (docs/methods.md §4.4): whether retrieval or the drafter drafts the next chunk."""
+    """What a boundary decides about the next chunk: who drafts it, and how many tokens to decode."""
 
     mode: str  # the proposer's name
     metric: float | None = None  # F (docs/methods.md §4.4); None if the decision does not use it

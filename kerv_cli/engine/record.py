@@ -57,7 +57,10 @@ class Round:
 
     @property
     def drafter(self) -> str:
-        """Name of the proposer that drafted, or empty if none did. In the modes `skip` and `parallel`, the mode."""
+        """Name of the proposer that drafted, or "" if no proposer drafted.
+
+        If the round's mode is "skip" or "parallel", the name of the mode.
+        """
         if self.mode in ("skip", PARALLEL):
             return self.mode
         return "" if self.proposer == "none" else self.proposer

@@ -124,7 +124,7 @@ class Artifact(Generic[T]):
         return f"run 'kerv {' '.join(self.command)}'"
 
     def anew(self, path: Path) -> str:
-        """Return the part of error messages that says how to replace an artifact of another target in `path`."""
+        """Return how to replace the artifact in `path`, which was made for another target, for error messages."""
         return self.again
 
     def path(self, results: str, name: str | None, target: Path) -> Path:

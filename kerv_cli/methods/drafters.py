@@ -177,7 +177,7 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         """
 
     def anew(self, path: Path) -> str:
-        """Return the part of error messages that says how to replace a drafter of another target in `path`.
+        """Return how to replace the drafter in `path`, which was trained for another target, for error messages.
 
         The user must remove the old drafter first, because a training can only be resumed for its own target.
         """

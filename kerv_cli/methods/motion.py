@@ -122,7 +122,10 @@ class CoarseBoundarySettings:
 
 @BoundaryPart("coarse", CoarseBoundarySettings, any_code=True)
 class Coarse(Boundary):
-    """Ends every chunk after at most `tokens` tokens. The missing coefficients (high frequencies) are zero."""
+    """Ends every chunk after at most `tokens` FAST tokens.
+
+    The tokens after them would give the coefficients of the highest frequencies. These coefficients are zero.
+    """
 
     @classmethod
     def build(cls, settings: Any, context: Context) -> Coarse:

@@ -33,8 +33,8 @@ class JacobiProposer(ChainProposer):
     """Guesses the remaining tokens of a chunk. After each forward, the target's tokens become the next guess.
 
     With strict acceptance this ends with the tokens of autoregressive decoding. If a prefill draft was rejected, the
-    first guess begins with the target's tokens after the rejection. All other tokens of the first guess stand for
-    normalised actions of 0, or end the chunk if an end token can.
+    first guess begins with the target's tokens after the rejection. Its other tokens are the end token, or the middle
+    token (normalised action 0) if chunks have no end token.
 
     Attributes:
         guess: The current guess of the remaining tokens.

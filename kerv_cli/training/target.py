@@ -516,11 +516,11 @@ def check_init(settings: TargetSettings, camera: str, description: TargetDescrip
 def continued_target(
     settings: TargetSettings, init: CompactTarget, camera: str, code: FastCode | None = None
 ) -> CompactTarget:
-    """Make a target that starts from the weights, action statistics and words of another target.
+    """Make a target that starts from the weights, action statistics and vocabulary of another target.
 
-    The query embeddings of a parallel target are newly initialised. So are embedding and head, if the tokens differ.
-    The encoder of an added view is a copy of the first view's. The weights from an added view to the estimated object
-    positions start at zero.
+    Weights that only the new target has, such as the query embeddings of a parallel target, are newly initialised. If
+    the action tokens differ, the token embedding and the head are newly initialised, too. The encoder of an added view
+    is a copy of the first view's. The weights from an added view to the estimated object positions start at zero.
 
     Args:
         settings: Shapes of the new target.

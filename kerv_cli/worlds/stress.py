@@ -373,7 +373,7 @@ class Push(Stress):
         self._push = self._middle
 
     def act(self, action: Array, step: int) -> Array:
-        """Return the action; while the hand is being pushed, its position part is replaced by the push."""
+        """Return the action. During a push, the push replaces the action's position part."""
         runs, begins = next(self._bursts)
         if begins:
             self._push = self._middle + unit_vector(self._random, len(self._half)) * self._half

@@ -129,7 +129,7 @@ class MetaWorld(StepBenchmark):
         return {"actions": action}
 
     def get_metadata(self) -> dict[str, Any]:
-        """Return the horizon and the control rate."""
+        """Return `max_steps`, the horizon in control steps, and `control_hz`, the control rate in hertz."""
         return {"max_steps": self.horizon, "control_hz": self.spec.actions.control_hz}
 
     def get_action_spec(self) -> dict[str, DimSpec]:

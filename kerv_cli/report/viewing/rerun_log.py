@@ -36,10 +36,10 @@ Steps = NDArray[np.int64]
 
 
 class _Log:
-    """Write data to a recording.
+    """Writes data to a Rerun recording.
 
     Attributes:
-        recording: The recording.
+        recording: Stream that the data is written to.
         hz: Control steps per simulated second.
     """
 
