@@ -70,7 +70,7 @@ def _unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
 
 
 def _unraisable_at_the_end(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Hide exceptions of objects that Ctrl-C left half-built. If Ctrl-C itself is hidden so, send it again."""
+    """Hide exceptions of objects that Ctrl-C left half-built. If one of them is Ctrl-C itself, send it again."""
     if unraisable.exc_type is KeyboardInterrupt:
         _unraisable(unraisable)
 

@@ -144,7 +144,11 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
 
 
 def _typed(overrides: Sequence[str], schema: type) -> dict[str, Any]:
-    """Parse overrides into a map from key to value. A list needs no brackets: `task=a,b`."""
+    """Parse overrides into a map from key to value. A list needs no brackets: `task=a,b`.
+
+    Raises:
+        UsageError: A key is given twice, a single value is needed but several are given, or no task is named.
+    """
     lists = {at.name for at in fields(schema) if str(at.type).startswith("list[")}
     typed: dict[str, Any] = {}
     for override in overrides:

@@ -133,7 +133,7 @@ def set_aside(folder: Path) -> Path:
 
 
 def _exchange(a: Path, b: Path) -> None:
-    """Replace folder `b` by folder `a`: in one step if the file system can, else `b` is removed first."""
+    """Replace folder `b` by folder `a`, in one step if the file system can do so. Else remove `b` first."""
     libc = ctypes.CDLL(None, use_errno=True)
     if hasattr(libc, "renameat2"):
         here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE

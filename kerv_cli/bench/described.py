@@ -139,7 +139,12 @@ def _prompt(settings: EstimateSettings, prompt: int) -> list[str]:
 
 
 def _of_model(settings: EstimateSettings) -> Described:
-    """Return the policy of `settings.model`: a shape's name, a `config.json`, its folder, or a target of kerv."""
+    """Return the policy of `settings.model`: a shape's name, a `config.json`, its folder, or a target of kerv.
+
+    Raises:
+        UsageError: The target's description states no width.
+        CheckpointError: The file does not describe a policy.
+    """
     name = settings.model
     if name in SHAPES:
         return Described(SHAPES[name], 7)
@@ -201,7 +206,15 @@ def _size(fields: Mapping[str, Any], key: str, default: int | None = None) -> in
 
 
 def _of_target(target: Mapping[str, Any], folder: Path) -> Described:
-    """Return the policy of a target's folder."""
+    """Return the policy that a target's description describes.
+
+    Args:
+        target: Content of the `target.json`.
+        folder: Folder of the target.
+
+    Raises:
+        UsageError: The description states no width.
+    """
     if target.get("family") == "openvla":
         read = read_shape(Path(target["settings"]["checkpoint"]))
         return Described(openvla(folder.name, read.language, read.towers), 7)

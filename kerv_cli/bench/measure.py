@@ -382,7 +382,13 @@ def title_of(model: Model) -> str:
 
 
 def document(model: Model, machine: Machine, phases: Sequence[Phase]) -> dict[str, Any]:
-    """Return the results of a benchmark for JSON (docs/formats.md); arguments from `measure`."""
+    """Return the results of a benchmark for JSON (docs/formats.md).
+
+    Args:
+        model: The model.
+        machine: The device's bandwidth and operations per second, from `measure`.
+        phases: The measured phases, from `measure`.
+    """
     device = str(model.target.device)
     return {
         "target": model.name,

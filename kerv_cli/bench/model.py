@@ -165,7 +165,7 @@ def _drafter(target: ReadableTarget) -> EagleNetwork:
 
 
 def blank(target: Any) -> Observation:
-    """Return an observation for a target in which all images are black and all numbers 0."""
+    """Return an observation for a target. All its images are black, and all its numbers are 0."""
     return still_observation(target, target.observation, target.settings.image_size)
 
 

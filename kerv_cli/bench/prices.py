@@ -143,7 +143,7 @@ class Estimate:
 
     @cached_property
     def parts(self) -> dict[str, tuple[float, str]]:
-        """By name of each part of an autoregressive decode: its seconds, and what takes most of them."""
+        """Maps each part of an autoregressive decode to its seconds and to what takes most of them."""
         profile, rest, parts = self.costs.profile, self.tokens - 1, {}
         for name, kind, seconds in (
             ("vision encoder", "encode", profile.seconds("encode", 1)),

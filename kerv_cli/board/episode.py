@@ -218,7 +218,14 @@ def show_episode(request: Request) -> Response:
 def _film_values(
     request: Request, found: FoundEpisode, step: int = 0, decodes: Sequence[DecodeRecord] | None = None
 ) -> dict[str, Any]:
-    """Return the values that the template of a film shows."""
+    """Return the values that the template of a film shows.
+
+    Args:
+        request: The request.
+        found: The episode.
+        step: Control step to show first.
+        decodes: Decodes of the episode. None: read them when they are needed.
+    """
     job = RECORDER.job(found.recording)
     values: dict[str, Any] = {"found": found, "step": step, "job": job, "film": None, "same": None, "rerun": ""}
     values |= {"slower": SLOWER, "imported": found.store.kind == IMPORT, "missing": "" if has_rerun() else NO_RERUN}

@@ -91,6 +91,9 @@ def _collected(app: Starlette) -> dict[str, str | bytes]:
     """Ask for the first page and for all pages and files that it leads to. Return the answers by address.
 
     Failed answers are left out. Parts that a browser loads later (`hx-trigger="load"`) are put into their page.
+
+    Raises:
+        KervError: The first page cannot be shown.
     """
     pages: dict[str, str | bytes] = {}
     waiting, films, episodes = ["/"], 0, 0
@@ -123,7 +126,7 @@ def _collected(app: Starlette) -> dict[str, str | bytes]:
 
 
 def _filled(app: Starlette, address: str, text: str) -> str:
-    """Return a page with the parts that a browser would load at once."""
+    """Fetch the part of a page that a browser loads right after the page, and return the page with this part."""
     late = re.search(r'<(section) id="(\w+)"[^>]* hx-get="([^"]+)" hx-trigger="load".*?</section>', text, re.DOTALL)
     if late is None:
         return text

@@ -1,4 +1,4 @@
-"""Lists what a results folder contains: studies, artifacts (weights and data), and commands that were started."""
+"""List what a results folder contains: studies, artifacts (weights and data), and commands that were started."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Imports evaluations that vla-eval ran. They become one study, with one setting per imported path.
+"""Import evaluations that vla-eval ran. They become one study, with one setting per imported path.
 
 A vla-eval recording is a SQLite file. If a kerv server decoded the episodes, their decodes are imported too
 (`read_served`). For other servers only success and number of steps are known.
@@ -327,7 +327,7 @@ def _identity(evaluations: Sequence[Evaluation]) -> dict[str, str]:
 def _imported(results: Path, episode: Episode, one: Evaluation, recorded: RecordedEpisode) -> ImportedEpisode:
     """Return an episode for the database, with its decodes if kerv served it.
 
-    Settings took no turns, so each evaluation is a block (episodes that one process ran) of its own.
+    vla-eval ran one setting after the other. So each evaluation is a block (episodes that one process ran) of its own.
 
     Args:
         results: The results folder, which holds the served episodes.

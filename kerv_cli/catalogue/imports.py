@@ -116,12 +116,12 @@ def connect_foreign(path: Path) -> sqlite3.Connection:
 
 
 def _in_database(path: Path, database: Database, name: str, stack: contextlib.ExitStack) -> list[Found]:
-    """Return the studies of a database file, which stays open until `stack` is closed.
+    """Return the studies in a database file, ready to be added to another database.
 
     Args:
-        path: The file.
-        database: The database to which they belong from now on.
-        name: Name that they get there. Empty: their own.
+        path: The file to read. It stays open until `stack` is closed.
+        database: The database to import the studies into.
+        name: Name of each study there. Empty: its own name.
         stack: Closes the file.
 
     Raises:
@@ -164,8 +164,8 @@ def _stored_episodes(connection: sa.Connection, path: Path, settings: dict[int, 
 
     Args:
         connection: The database.
-        path: Its file, for the message.
-        settings: The settings by their id in this database.
+        path: File of that database, for error messages.
+        settings: The settings by their id in that database.
 
     Raises:
         CheckpointError: The file is damaged, or the decodes of an episode are too large.

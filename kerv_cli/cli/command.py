@@ -1,8 +1,8 @@
 """Declare the commands of `kerv`: the decorator `command` turns a function into the command of that name.
 
 The decorator puts the function into kerv's registry. From that entry (a `Part` of kind `command`) this module makes
-typer's command with its options, settings, help and completion. The function is one of typer's. kerv fills in three of
-its parameters, all others are typer's options:
+typer's command with its options, settings, help and completion. The function is written as for typer. kerv fills in
+three of its parameters. All other parameters are typer's options:
 
 - `settings`: The command's settings, composed and checked. The command then has the option --cfg.
 - `overrides`: The `key=value` arguments as typed.
@@ -118,7 +118,10 @@ def commands(words: str = "") -> dict[str, Command]:
 
 
 def typer_command(part: Command) -> TyperCommand:
-    """Make a typer command from a registered command. Its `invoke` fills in the arguments that are kerv's."""
+    """Make a typer command from a registered command.
+
+    Its `invoke` passes settings, overrides and names to the command's function.
+    """
     words = {**CONTEXT, "allow_extra_args": True}  # typer would import pydantic to parse arguments
     made = _made(part.code, name=part.name, cls=CommandWithSettings, help=part.help, context_settings=words)
     made.part, made.short_help = part, part.summary

@@ -103,7 +103,15 @@ def power(names: list[str], as_json: AsJson = False) -> None:
 
 
 def _two(names: list[str], what: str) -> tuple[list[str], Mapping[str, Fraction]]:
-    """Split the arguments into two counts or rates, and the numbers given as `key=number`."""
+    """Split the arguments into two counts or rates, and the numbers given as `key=number`.
+
+    Args:
+        names: The arguments.
+        what: What the two are, for the error message.
+
+    Raises:
+        UsageError: There are not exactly two counts or rates, or a number cannot be read.
+    """
     words, numbers = [], {}
     for word in names:
         key, equals, value = word.partition("=")
@@ -125,7 +133,11 @@ def _number(text: str, key: str = "") -> Fraction:
 
 
 def _counts(text: str) -> tuple[int, int]:
-    """Return successes and episodes of a text such as `17/20`."""
+    """Return successes and episodes of a text such as `17/20`.
+
+    Raises:
+        UsageError: The text has another form, or more successes than episodes.
+    """
     found = re.fullmatch(r"(\d+)/(\d+)", text)
     if not found:
         raise UsageError(f"'{text}' is no success count such as 17/20; for runs: kerv runs compare")

@@ -46,7 +46,7 @@ def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a r
         names: The names as typed.
         least: Minimum number of names.
         most: Maximum number of names.
-        what: What to name, text for the error message.
+        what: What the user must name, for the error message.
 
     Raises:
         UsageError: There are too few or too many names.
@@ -131,7 +131,8 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
 def label(settings: CommandSettings, names: list[str]) -> None:
     """Write tags and a note to a run. `kerv runs list tag=…`, the board and exports show them.
 
-    NAME: a run (id, a unique part of it, or last), tag= (several: tag=a,b), note= and results=DIR. Empty: removed.
+    NAME: a run (id, a unique part of it, or last), tag= (several: tag=a,b), note= and results=DIR. An empty tag= or
+    note= removes what was written.
 
     Examples:
         kerv runs label last tag=baseline
@@ -160,7 +161,7 @@ def label(settings: CommandSettings, names: list[str]) -> None:
 def watch(settings: CommandSettings, names: list[str]) -> None:
     """Follow what runs, from any terminal, until it ends: how far it is, and how long it takes.
 
-    NAME: a run (id, or a unique part of it) and results=DIR. Without a name: all that run.
+    NAME: a run (id, or a unique part of it) and results=DIR. Without a name: all that are running.
 
     Examples:
         kerv runs watch

@@ -140,5 +140,5 @@ class StrictRule(DistanceRule):
     """Accepts only draft tokens that equal the target's. Decoding is then lossless."""
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """Return zero for every DoF (D,), whatever `r` is. With a code, which has no DoFs: a single zero."""
+        """Return one zero for each of the D DoFs, or a single zero for a code of chunks. The radius `r` is not used."""
         return (0,) * self.space.kinds

@@ -92,7 +92,11 @@ def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
 
 
 def _check_expert(settings: RolloutSettings) -> None:
-    """Refuse settings that need a decoding method, because the expert decodes nothing."""
+    """Refuse settings that need a decoding method, because the expert decodes nothing.
+
+    Raises:
+        UsageError: Such a setting has another value than its default.
+    """
     plain, default = (
         {"rollout.batch": each.rollout.batch, "deviation_every": each.deviation_every, "chunk": each.chunk}
         | each.parts()
@@ -219,7 +223,11 @@ def profiled(profile: Profile, scale: float = 1.0) -> Latency:
 
 
 def _profile_path(settings: RolloutSettings) -> Path:
-    """Return the path of `rollout.profile`, which is a file or a name in <results>/bench."""
+    """Return the path of `rollout.profile`, which is a file or a name in <results>/bench.
+
+    Raises:
+        UsageError: There is no such file.
+    """
     name, results = settings.rollout.profile, settings.results
     for path in (Path(name).expanduser(), results_dir(results) / "bench" / f"{name}.json"):
         if path.is_file():

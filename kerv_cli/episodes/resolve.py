@@ -1,4 +1,4 @@
-"""Composes the settings of a study or of a rollout, from preset files and the command line. It loads no torch."""
+"""Compose the settings of a study or of a rollout, from preset files and the command line. It loads no torch."""
 
 from __future__ import annotations
 

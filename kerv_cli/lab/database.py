@@ -265,7 +265,11 @@ class Database:
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[sa.Connection]:
-        """Yield a connection for reading. If there is no database yet, yield one with empty tables."""
+        """Yield a connection for reading. If there is no database yet, yield one with empty tables.
+
+        Raises:
+            StorageError: The database cannot be read, or its file was written during reading.
+        """
         with self._errors():
             if self._engine is None and not self.exists:
                 engine = sa.create_engine("sqlite://", poolclass=sa.pool.NullPool)
@@ -388,7 +392,11 @@ def file_url(results: Path) -> sa.URL:
 
 @functools.cache
 def _server(url: sa.URL) -> sa.Engine:
-    """Return the SQLAlchemy engine for a server. It is shared within this process."""
+    """Return the SQLAlchemy engine for a server. It is shared within this process.
+
+    Raises:
+        UsageError: The package psycopg is not installed.
+    """
     try:
         from kerv_cli.lab.postgresql import connect
     except ModuleNotFoundError:
@@ -469,7 +477,11 @@ def _begin(connection: sa.Connection) -> None:
 
 
 def _check_tables(connection: sa.Connection) -> None:
-    """Refuse a view in place of a table: its query may never end."""
+    """Refuse a view in place of a table, because the view's query may never end.
+
+    Raises:
+        Damaged: There is such a view.
+    """
     for name in _META.tables.keys() & set(sa.inspect(connection).get_view_names()):
         raise Damaged(f"{name} is a view, not a table")
 

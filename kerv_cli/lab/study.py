@@ -170,6 +170,9 @@ def run_blocks(study: Study, prepare: Prepare, record: Run, on_event: OnEvent) -
         prepare: Builds a setting's decoder for a task. Used in this process only.
         record: The database row of this command.
         on_event: Called with each event, to show progress.
+
+    Raises:
+        Detached: `runtime.detach` is set, and workers of a cluster run the blocks. The message names them.
     """
     runtime, blocks = study.runtime, study.blocks
     queue = Queue(study, record.id)

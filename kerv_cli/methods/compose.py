@@ -120,7 +120,11 @@ class Method:
             self._check_batch(batch)
 
     def _check_batch(self, batch: int) -> None:
-        """Check that the method can decode several episodes together."""
+        """Check that the method can decode several episodes together.
+
+        Raises:
+            UsageError: The method cannot. The message names the part that decodes only one episode at a time.
+        """
         draft, skip = self.prefill_draft, self.skip
         threshold = registry.ThresholdPart.find(self.settings["threshold"].kind)
         is_used = draft.absent or skip.takes_draft

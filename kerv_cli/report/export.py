@@ -38,7 +38,7 @@ def export(run: RunEntry, database: Database, to: str, folder: Path) -> list[Pat
 
     Raises:
         UnknownName: There is no such format.
-        UsageError: The run has no episodes.
+        UsageError: The run has no episodes. Or `to` is `trace` and the chunks differ in length.
         StorageError: The disk is full or not writable.
     """
     if to not in FORMATS:
@@ -82,7 +82,11 @@ def _to_parquet(store: Study, frame: pd.DataFrame, folder: Path) -> list[Path]:
 
 
 def _to_trace(store: Study, frame: pd.DataFrame, path: Path) -> None:
-    """Write every decode of a study's episodes as a line of a trace (docs/trace.md)."""
+    """Write every decode of a study's episodes as a line of a trace (docs/trace.md).
+
+    Raises:
+        UsageError: The chunks of a setting differ in length.
+    """
     settings = {one.label: one.settings for one in store.load().settings}
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for label, part in frame.groupby("label", sort=False):

@@ -34,7 +34,7 @@ RATIO = "ratio"
 
 @dataclass(frozen=True)
 class Measures:
-    """What was measured of a group of episodes. A measure without data is NaN.
+    """The measured values of a group of episodes. A measure without data is NaN.
 
     Attributes:
         successes: Number of solved worlds. Repeats measure the same world again and are not counted.
@@ -57,7 +57,8 @@ class Measures:
         unverified_share: Share of executed tokens that the target did not verify.
         compensation_rate: Share of decodes in which a prediction, not the target, filled in tokens.
         retrieval_share: Share of decodes in which retrieval drafted.
-        deviation: Mean absolute difference between the executed actions and AR's, in normalised units.
+        deviation: Mean absolute difference between the executed actions and those of AR (autoregressive
+            decoding), in normalised units.
         felt_latency_ms: Mean time that the world went on during a decode.
         felt_latency_steps: Mean number of control steps that the world went on during a decode.
         held_share: Share of control steps that repeated the last action, because no newer one had arrived.
@@ -74,8 +75,8 @@ class Measures:
         decodes: Number of decodes.
         deviation_samples: Number of decodes whose deviation was measured.
         speedup: Speed per control step against the baseline, see `measures.speedups`.
-        episode_speedup: Speed per episode.
-        solved_speedup: Speed per episode, over the pairs that both solved.
+        episode_speedup: Speed per episode against the baseline.
+        solved_speedup: Speed per episode against the baseline, over the pairs in which both solved the task.
     """
 
     successes: int
@@ -197,7 +198,7 @@ class Result:
 
     @property
     def is_compared(self) -> bool:
-        """Whether there are pairs to compare the setting with its baseline. Never so for the baseline itself."""
+        """Whether there are pairs to compare the setting with its baseline. False for the baseline itself."""
         return not self.is_baseline and self.measures.pairs > 0
 
     @property
@@ -401,7 +402,9 @@ class Speeds(NamedTuple):
 
 
 def speedups_of_runs(runs: Sequence[pd.DataFrame], averaging: str, same_pairs: bool) -> dict[Hashable, Speeds]:
-    """Return the speedups of each group of pairs over several runs (docs/methods.md §7). A single run has its own.
+    """Return the speedups of each group of pairs, with intervals over the runs (docs/methods.md §7).
+
+    With a single run, return the speedups of that run, with intervals over its episodes.
 
     Args:
         runs: One table made by `paired` per run.

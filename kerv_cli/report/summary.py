@@ -241,7 +241,7 @@ def _parts(frame: pd.DataFrame, width: int) -> Iterator[pd.DataFrame]:
 def not_in_turn(results: Sequence[Result]) -> list[str]:
     """Return labels of settings that were timed but have no speedup.
 
-    They have none because no pair was measured in the same block as its baseline.
+    In none of their pairs did the two episodes run in one block (side by side in one process).
     """
     apart: dict[str, None] = {}
     for row in results:

@@ -122,6 +122,9 @@ class OpenPi(Conversation):
         """Return the actions that the robot has executed since the latest answer.
 
         These are the first `executed` actions of that answer, or all its actions if the message has no `executed`.
+
+        Raises:
+            UsageError: `executed` is not a number from 0 to the number of actions of that answer.
         """
         count = message.get(EXECUTED, len(self.last))
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 0 <= count <= len(self.last):

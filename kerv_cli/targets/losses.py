@@ -49,11 +49,11 @@ def token_loss(logits: Tensor, tokens: Tensor, labels: Tensor, counted: Tensor |
 
 
 def within_chunk(tokens: Tensor, end: int | None) -> Tensor:
-    """Return (B, N) bool: which of these tokens belong to their chunk. Those after its end token do not.
+    """Return which tokens belong to their chunk, (B, N) bool. Tokens after the end token do not.
 
     Args:
         tokens: (B, N) tokens.
-        end: The token that ends a chunk, which belongs to it. None: all tokens do.
+        end: The token that ends a chunk. It belongs to the chunk itself. None: all tokens belong to their chunk.
     """
     ends = tokens == (-1 if end is None else end)
     return ends.cumsum(1) - ends.long() == 0

@@ -162,7 +162,7 @@ def check_spaces(dataset: DemoDataset, actions: ActionSpace, observation: Observ
         dataset: The demonstrations.
         actions: Expected action space.
         observation: Expected observation space.
-        owner: What has the expected spaces, such as "the target", for the error message.
+        owner: Whose spaces are expected, such as "the target", for the error message.
 
     Raises:
         CheckpointError: The actions or the observations differ.

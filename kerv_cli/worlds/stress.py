@@ -1,4 +1,4 @@
-"""Stress: disturbances of known size that make the evaluated world differ from the training's (docs/stress.md).
+"""Stress: disturbances of known size, so that the evaluated world differs from the training world (docs/stress.md).
 
 Kinds of stress change the model (light, colour, camera, objects), actions (push, actuation) or images (sensor).
 """

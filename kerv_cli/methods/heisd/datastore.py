@@ -362,8 +362,8 @@ def neighbour_tree(
         Args:
             parent: Last node of the path.
             level: Number of groups on the path.
-            last: The neighbours that have the last group.
-            whole: The neighbours that have every group. If there are none, `last`.
+            last: Bit set of the neighbours whose chunks have the last group of the path.
+            whole: Bit set of the neighbours whose chunks have all groups of the path. If none has, `last`.
             cost: −log probability of the path.
         """
         strict, givers = levels[level] if level < len(levels) else (False, [])

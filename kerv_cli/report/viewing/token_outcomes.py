@@ -74,7 +74,8 @@ def threshold_of(decode: DecodeRecord) -> tuple[int, ...]:
 def token_names(decodes: Sequence[DecodeRecord], dofs: Sequence[str]) -> Sequence[str]:
     """Return the names of a control step's tokens: the names `dofs`, or a single name for tokens of a code.
 
-    A code of whole chunks (docs/methods.md §0.3) shows in a decode whose tokens fill no whole control steps.
+    A code encodes whole chunks (docs/methods.md §0.3). Decodes whose number of tokens is no multiple of D come from a
+    code.
     """
     for decode in decodes:
         if not decode.compensated and len(decode.tokens) % len(dofs):
@@ -111,7 +112,7 @@ def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome
     """Return the outcome of each token of a decode's chunk.
 
     A rejected token stays `rejected` even if a prediction replaced it later. All other tokens that were not executed
-    are `dropped`. Where a chunk of a code has ended there is no token: `ended`.
+    are `dropped`. With a code of whole chunks, positions after the chunk's end are `ended`.
 
     Args:
         decode: The decode.

@@ -294,9 +294,18 @@ class Program:
         results: np.ndarray | None = None,
         end: int | None = None,
     ) -> np.ndarray:
-        """Execute the program len(results) times, or once without results. Return the frames (rows, size).
+        """Execute the program once, or as often as `results` has rows. Return the frames (rows, size).
 
-        With `end`, stop after the execution whose result it is.
+        Args:
+            inputs: Inputs of the first execution.
+            positions: (T,) rotary positions. None if the program has no attention.
+            cache: Keys and values of earlier tokens. None: there are no earlier tokens.
+            mask: Result of `attention_mask`. None: attention is causal.
+            results: (times, 1, B) float32, filled with the result of each execution. None: execute once.
+            end: Result after which to stop. None: stop only after the last execution.
+
+        Raises:
+            IndexError: The cache has too little room for the new tokens.
         """
         where = np.zeros(1, np.int64) if positions is None else positions.numpy()
         rows, tokens = inputs[0].numel() // self.places[0][1], len(where)
@@ -324,7 +333,10 @@ class Program:
         return frames
 
     def _alternate(self, times: int, end: int, frames: np.ndarray, *rest: Any) -> None:
-        """Execute the program if oneDNN multiplies some of the matrices: a compiled call from each to the next."""
+        """Execute a program in which oneDNN multiplies some of the matrices.
+
+        One compiled call executes the operations between two such matrices.
+        """
         memory, run = torch.from_numpy(frames), self.run
         where, start, buffer, keys, values, filled, seen, results = rest
         for time in range(times):
@@ -343,7 +355,7 @@ class Program:
 
 
 def _executed(results: np.ndarray) -> int:
-    """Return how many executions have a result, of results (times, 1, B)."""
+    """Return how many of the executions ran. `results` has the shape (times, 1, B)."""
     return int((results[:, 0, 0] != NOTHING).sum())
 
 

@@ -330,7 +330,10 @@ class CompactTarget(Compilable):
         return tokens[:, 0].astype(int).tolist()
 
     def predict(self, tokens: Tensor, positions: Tensor, cache: Cache, seen: Seen) -> tuple[Tensor, Tensor]:
-        """Read T new tokens, if compiled in one call. `PredictsTokens.predict` explains arguments and results."""
+        """Predict the token after each of T new tokens, in one call if this target is compiled.
+
+        `PredictsTokens.predict` explains arguments and results.
+        """
         if self.compiled is None or cache.fixed:
             hidden = self(self.embed(tokens[None]), positions, cache, seen)
             return self.head(hidden[0]).argmax(-1), hidden

@@ -79,7 +79,13 @@ class Reference:
         return {k.removeprefix(prefix): v for k, v in self.state.items() if k.startswith(prefix)}
 
     def _loaded(self, model: Any, weights: Mapping[str, Tensor], strict: bool = False) -> Any:
-        """Return a model with these weights, all of which it must know."""
+        """Load weights into a model, move it to the device, and return it. Every weight must belong to the model.
+
+        Args:
+            model: A model of transformers.
+            weights: The weights, under transformers' names.
+            strict: Whether every weight of the model must be given.
+        """
         assert not model.load_state_dict(weights, strict=strict).unexpected_keys
         return model.to(device=self.device, dtype=self.dtype).eval()
 

@@ -309,11 +309,11 @@ def foreign_table(source: Path | bytes, columns: Sequence[str] = (), most: int =
 
 
 def _expanded(metadata: pq.FileMetaData, group: int, columns: Sequence[str]) -> tuple[int, int]:
-    """Return how many bytes some columns of a row group take in memory, as far as the file states it.
+    """Estimate from the file's metadata how much memory some columns of a row group take.
 
     Returns:
-        size: All columns, at most. Repeated text and bytes count once, unless they are in lists.
-        text: Text and bytes alone, each counted once. At least 1.
+        size: Largest number of bytes of all these columns. Repeated text counts once, unless it is in lists.
+        text: Number of bytes of the columns with text or binary data. Repeated text counts once. At least 1.
     """
     chunks, rows = metadata.row_group(group), metadata.row_group(group).num_rows
     total, text = _LEAST_ROW * rows, 1

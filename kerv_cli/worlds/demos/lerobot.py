@@ -249,7 +249,19 @@ def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProg
 
 
 def _import(source: Source, settings: DemosImportSettings, folder: Path, progress: OnProgress) -> None:
-    """Write the demonstrations into an empty folder."""
+    """Write the demonstrations into an empty folder. `import_lerobot` explains the other arguments.
+
+    Args:
+        source: The LeRobot dataset.
+        settings: Settings of `kerv demos import`.
+        folder: The empty folder.
+        progress: Called after every episode.
+
+    Raises:
+        UsageError: The dataset does not fit the environment or the names of DoFs, or its name is taken.
+        UnknownName: There is no such environment, or the dataset has no such strict DoF.
+        CheckpointError: A file is damaged, too large, or holds too many episodes for its size.
+    """
     chosen = source.episodes[: settings.episodes or None]
     world = _world_of(source, settings)
     names = _task_names(source.tasks, world)

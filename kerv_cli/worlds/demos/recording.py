@@ -287,7 +287,11 @@ _Outcomes = dict[int, EpisodeEntry | None]  # seed -> the manifest's entry, None
 def _run_jobs(
     config: DemoConfig, out: Path, jobs: Sequence[tuple[str, range]], make_actor: MakeActor | None
 ) -> Iterator[tuple[str, _Outcomes]]:
-    """Record all jobs, each a task with some seeds, in several processes. Yield the results as they come."""
+    """Record all jobs, each a task with some seeds, in several processes. Yield the results as they come.
+
+    Raises:
+        KervError: A worker process was killed.
+    """
     if config.workers == 1 or len(jobs) == 1:
         yield from (_record_seeds(config, out, task, seeds, make_actor) for task, seeds in jobs)
         return
