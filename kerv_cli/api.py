@@ -105,8 +105,8 @@ def rollout(*overrides: str, grid: bool = False, **settings: object) -> Study:
         **settings: Settings as keywords, such as `method="spec_vla", task="reach"`.
 
     Raises:
-        UsageError: A setting does not exist, or its value is impossible.
-        CheckpointError: The policy, or an artifact that the method needs, is missing or damaged.
+        UsageError: A setting or the policy does not exist, or a value is impossible.
+        CheckpointError: The policy is damaged, or an artifact that the method needs is missing or damaged.
         Interrupted: The user pressed Ctrl-C. Complete episodes are kept.
         KervError: An episode failed.
     """
@@ -129,8 +129,8 @@ def sweep(study: str | Path, *overrides: str, **settings: object) -> Study:
         **settings: Settings as keywords. They, too, apply to each of the study's settings.
 
     Raises:
-        UsageError: A setting does not exist, or its value is impossible.
-        CheckpointError: The policy, or an artifact that a method needs, is missing or damaged.
+        UsageError: A setting or a policy does not exist, or a value is impossible.
+        CheckpointError: A policy is damaged, or an artifact that a method needs is missing or damaged.
         Interrupted: The user pressed Ctrl-C. Complete episodes are kept.
         KervError: Some episodes failed. The others are kept.
     """
@@ -237,8 +237,8 @@ def load_policy(
         **settings: Settings of `kerv serve` as keywords, such as `gripper="signed"`.
 
     Raises:
-        UsageError: A setting does not exist, or its value is impossible.
-        CheckpointError: The policy is missing, or an artifact that the method needs is missing or belongs to another
+        UsageError: A setting or the policy does not exist, or a value is impossible.
+        CheckpointError: The policy is damaged, or an artifact that the method needs is missing or belongs to another
             policy.
     """
     typed = as_overrides(*overrides, **{"policy.target": target, "method": method, "task_name": task}, **settings)

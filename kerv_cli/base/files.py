@@ -264,7 +264,7 @@ def read_yaml_lines(path: Path, what: str) -> tuple[dict[str, Any], dict[str, in
         The mapping, and the line number of each key. Nested keys are joined by dots, such as `threshold.r`.
 
     Raises:
-        UsageError: The file cannot be read, contains no mapping, gives a key twice, or is too large.
+        UsageError: The file cannot be read, is not YAML, contains no mapping, gives a key twice, or is too large.
     """
     import yaml
 

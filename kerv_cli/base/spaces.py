@@ -183,7 +183,7 @@ class ActionSpace:
             start = last
 
     def strict_tokens(self, size: int) -> np.ndarray:
-        """Return (size,) bool: which of a chunk's first `size` tokens are of strict DoFs. With a code, all are."""
+        """Return which of a chunk's first `size` tokens belong to strict DoFs, (size,) bool. With a code, all do."""
         return np.resize(self.is_strict, size) if self.code is None else np.ones(size, dtype=bool)
 
     def normalise(self, actions: np.ndarray) -> np.ndarray:

@@ -65,7 +65,11 @@ class Impatient(H11Protocol):
         self.loop.call_later(PATIENCE, self._check, None)
 
     def _check(self, before: object) -> None:
-        """Close a waiting connection that has sent no request since the last check, when its request was `before`."""
+        """Close the connection if it waits for a request and has sent none since the last check.
+
+        Args:
+            before: The newest request at the last check. None: there was none yet.
+        """
         waits = self.cycle is None or self.cycle.response_complete
         if waits and self.cycle is before:
             self.transport.close()

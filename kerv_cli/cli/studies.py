@@ -47,8 +47,8 @@ def planned_study(resolved: ResolvedStudy, command: Sequence[str], is_rollout: b
         is_rollout: Whether to plan a rollout.
 
     Raises:
-        UsageError: The study cannot run with these settings.
-        CheckpointError: The policy or an artifact that a method needs is missing or damaged.
+        UsageError: The study cannot run with these settings, or there is no such policy.
+        CheckpointError: The policy is damaged, or an artifact that a method needs is missing or damaged.
     """
     from kerv_cli.episodes.resolve import idle_overrides
 

@@ -1,4 +1,4 @@
-"""The cost model: predicts a decode's seconds from its forwards and a measured latency profile (docs/measuring.md).
+"""The cost model predicts a decode's seconds from its forwards and a measured latency profile (docs/measuring.md).
 
 Every forward and draft has a kind of cost, such as `prefill`, `verify` or `draft`. A profile has the seconds of each
 kind.

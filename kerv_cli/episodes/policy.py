@@ -51,9 +51,9 @@ def check(settings: RolloutSettings) -> dict[str, str]:
         The key `observation` says what the policy observes, such as `vision`.
 
     Raises:
-        UsageError: A number is out of range, a seed is a training seed, the policy was trained on another camera, or
-            parts do not fit together.
-        CheckpointError: The policy is missing or damaged, or a file belongs to another target or action space.
+        UsageError: There is no such policy, a number is out of range, a seed is a training seed, the policy was trained
+            on another camera, or parts do not fit together.
+        CheckpointError: The policy is damaged, or an artifact is missing or belongs to another target or action space.
     """
     tasks = resolve_tasks(settings.task)
     spec = spec_of(tasks[0])
@@ -156,7 +156,7 @@ def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
 
     Raises:
         UsageError: The settings cannot run; `check` lists the reasons.
-        CheckpointError: The policy is missing or damaged, or a file belongs to another target or action space.
+        CheckpointError: The policy is damaged, or an artifact is missing or belongs to another target or action space.
     """
     spec = spec_of(task)
     expert = settings.policy.kind == EXPERT

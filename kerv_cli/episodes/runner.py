@@ -1,4 +1,4 @@
-"""Runs episodes in the worlds (open environments) of this process: one after the other, or several at once.
+"""Run episodes in the worlds (open environments) of this process: one after the other, or several at once.
 
 All settings in a process share weights, datastores and worlds. Each setting has its own decoder, because a skip rule
 may depend on earlier episodes. Each setting also renders its own images, so that no setting gains from the caches of

@@ -302,10 +302,10 @@ def command_to_go_on(database: Database, kind: str, folder: Path) -> tuple[str, 
 
 
 def interrupted(database: Database, kind: str, command: Sequence[str], name: str | None = None) -> RunRow | None:
-    """Return the row of an interrupted command's first attempt, counted since the command last completed.
+    """Return the row of an interrupted command: of its first attempt after it was complete for the last time.
 
-    Returns None if the command has no row or its newest row is complete. Also returns None if another command has made
-    the same study or artifact since.
+    None if the command has no row, or if its newest row is complete. Also None if another command has made the same
+    study or artifact since.
 
     Args:
         database: The database.

@@ -1,4 +1,4 @@
-"""Plans a study and runs it: `plan` finds the missing episodes, `run` runs them and follows their progress."""
+"""Plan a study and run it: `plan` finds the missing episodes, `run` runs them and follows their progress."""
 
 from __future__ import annotations
 
@@ -202,7 +202,7 @@ def run_blocks(study: Study, prepare: Prepare, record: Run, on_event: OnEvent) -
 
 
 def _kept(study: Study) -> str:
-    """Return how many episodes of a study are stored, as text. If the database does not answer: `all complete …`."""
+    """Return how many episodes of a study are stored, as text. The text has no numbers if the database fails."""
     try:
         return "{} of {} episodes".format(*study.counts())
     except StorageError:

@@ -334,7 +334,10 @@ class Queue:
                 return row
 
     def _held_outside(self, connection: sa.Connection, run: str) -> set[tuple[Any, ...]]:
-        """Return the keys of episodes that other workers run for other commands. One command's blocks share none."""
+        """Return the keys of episodes that other workers run for commands other than `run`.
+
+        The blocks of one command share no episode, so its own episodes need no check.
+        """
         query = sa.select(QUEUE.c.episodes).join(STUDIES, STUDIES.c.id == QUEUE.c.study_id)
         query = query.where(QUEUE.c.run != run, QUEUE.c.worker != self.worker, ~_is_free(connection))
         # rollouts share no episodes with other studies
@@ -609,7 +612,10 @@ class _Attempt:
         self.on_event(EpisodeEnd(one, bool(row["success"]), float(row["wall_seconds"])))
 
     def _write(self, one: Episode, row: dict[str, Any], decodes: bytes) -> None:
-        """Write an episode and its decodes, link the episode to the study, and begin the next one. One transaction."""
+        """In one transaction, write an episode and its decodes, and link the episode to the study.
+
+        The same transaction notes which episode is running now.
+        """
         block = self._row  # computed before others have to wait
         with self.queue.database.writing() as connection:
             self.queue.hold(connection, self.claim, self.running)
@@ -628,8 +634,8 @@ class _Attempt:
         """Note that a setting failed on a task. Its remaining episodes in the block will not run.
 
         Raises:
-            StorageError: This was the failure. Then no other setting can be stored either.
-            ClaimLost: The block does not belong to this worker any more.
+            StorageError: The setting failed with this error. No other setting could be stored either.
+            ClaimLost: The setting failed with this error: the block does not belong to this worker any more.
         """
         if isinstance(failure.error, StorageError | ClaimLost):
             raise failure.error

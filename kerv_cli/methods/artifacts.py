@@ -230,7 +230,19 @@ class Artifact(Generic[T]):
 
 
 class Artifacts:
-    """The target and the artifacts of one policy, checked and loaded on demand."""
+    """The target and the artifacts of one policy, checked and loaded on demand.
+
+    Args:
+        results: The results folder.
+        policy: Names of the target and the artifacts.
+        search: Settings of the search in a datastore. None: exact search.
+        device: Device to load the weights to.
+        dtype: Number format to convert the weights to.
+
+    Raises:
+        UsageError: There is no such target.
+        UnknownName: `policy.artifacts` names a kind of artifact that does not exist.
+    """
 
     def __init__(
         self, results: str, policy: PolicySettings, search: Any = None, device: str = "cpu", dtype: str = "float32"

@@ -114,7 +114,7 @@ def planned_certificate(
 
     Raises:
         UsageError: The policy was tested before and `settings.again` is not set, or its seeds were used before.
-        CheckpointError: An artifact of a candidate is missing or damaged.
+        CheckpointError: An artifact of a candidate is missing or damaged, or an existing certificate is damaged.
     """
     tested = _candidates(resolved)
     first = next(iter(tested.values()))
@@ -168,6 +168,7 @@ def charged(
     Raises:
         UsageError: The policy was tested before and `again` is not set. Or an earlier test of this policy used one of
             these seeds. Or another study ran the policy on one of these tasks and seeds.
+        CheckpointError: A certificate is damaged.
     """
     earlier = attempts_on(certificate.target, paths)
     for number, attempt in enumerate(earlier):
@@ -193,6 +194,9 @@ def attempts_on(target: str, folders: Iterable[Path]) -> list[Attempt]:
     Args:
         target: Hash of the policy's weights.
         folders: Folders of existing certificates.
+
+    Raises:
+        CheckpointError: A certificate is damaged.
     """
     found: list[Attempt] = []
     artifact = CertificateArtifact()

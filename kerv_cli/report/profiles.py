@@ -48,10 +48,11 @@ class NamedProfile:
 
     @property
     def encoders(self) -> dict[str, Profile]:
-        """The profile with other times of the vision encoder, by the keys of `ENCODERS`.
+        """One profile for each key of `ENCODERS`. It assumes another time of the vision encoder.
 
-        The engine's system time is added to each time. The floor is the shortest time that the device's bandwidth and
-        arithmetic allow. Empty if the profile does not have the encoder's floor.
+        These times are the encoder's floor, twice the floor, and eight milliseconds. The floor is the shortest time
+        that the device's bandwidth and arithmetic allow. The engine's system time is added to each. Empty if the
+        profile does not have the encoder's floor.
         """
         about, phases = self.profile.about, self.profile.phases
         floor, system = about.get("encoder_floor"), float(about.get("encoder_system", 0.0))

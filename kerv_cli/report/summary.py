@@ -97,7 +97,7 @@ def interval(estimate: Estimate, form: str = ".2f", unit: str = "", scale: float
     Args:
         estimate: The estimate.
         form: Format of the numbers. With `.0f` the value still gets one decimal, unless that decimal is 0. So a success
-            of 99.5 % does not read as 100 %.
+            of 99.5 % does not read as 100 %. With `.2f`, an estimate of 10 or more gets only one decimal.
         unit: Text after the value.
         scale: Factor for value and interval; 100 for per cent.
         between: Text between the two ends of the interval.

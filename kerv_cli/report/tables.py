@@ -262,7 +262,7 @@ def _with_new_seeds(episodes: pd.DataFrame) -> list[pd.DataFrame]:
 
 
 def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
-    """Add the columns difficulty, device, dtype and threads to the episodes."""
+    """Add the columns difficulty, device, dtype and threads. Turn initial states into tuples, which can be compared."""
     runtimes = pd.DataFrame([one.settings["runtime"] for one in study.settings], study.labels, list(RUNTIME))
     difficulty = episodes["task"].map(functools.cache(difficulty_of))
     states = episodes["initial_state"].map(tuple)  # tuples can be compared
@@ -362,7 +362,7 @@ def with_matched_speed(rows: Sequence[Result]) -> list[Result]:
 def safety(row: Result) -> tuple[float, float]:
     """Return the key that sorts settings from the safest on. It does not depend on success.
 
-    The setting with the smallest unverified share comes first: the share of executed actions that the target has not
+    The setting with the smallest unverified share comes first: the share of executed tokens that the target has not
     verified, rounded to whole per cent. Settings that decode nothing come last. Of settings with equal shares, the one
     with the most target forwards per control step comes first.
     """

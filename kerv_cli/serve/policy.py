@@ -52,8 +52,9 @@ class Policy:
 
     Raises:
         UnknownName: The policy's environment has no task with that name.
-        UsageError: A setting is out of range, parts of the method do not fit together, or a task must be named.
-        CheckpointError: There is no such policy, or an artifact belongs to another policy.
+        UsageError: There is no such policy, a setting is out of range, parts of the method do not fit together, or a
+            task must be named.
+        CheckpointError: The policy is damaged, or an artifact is missing or belongs to another policy.
     """
 
     def __init__(self, settings: ServeSettings) -> None:

@@ -175,7 +175,8 @@ def grow(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
         The target's folder, and numbers to print by name, such as the number of weights.
 
     Raises:
-        UsageError: The policy is not a compact target, or it is larger than the new shape.
+        UsageError: There is no such policy, it is not a compact target, or it is larger than the new shape.
+        CheckpointError: The policy is damaged.
     """
     base = find_target(settings.results, settings.base).resolve()
     description = checkpoint.read_target(base)

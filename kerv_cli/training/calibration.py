@@ -82,10 +82,10 @@ def calibrate(
         The path of the JSON file, the calibration, and one line per section that was not measured, with the reason.
 
     Raises:
-        UsageError: A number is out of range, or a task is unknown.
-        CheckpointError: The target or the demonstrations do not exist. Or the demonstrations are of another
-            environment or hold images of another size than the target takes. Or the datastore is of another target. Or
-            no end-effector path is curved.
+        UsageError: A number is out of range, or a task is unknown. Or the target does not exist, or does not decode
+            token by token. Or the calibration of a shipped policy would be replaced.
+        CheckpointError: The demonstrations do not exist, are of another environment, or hold images of another size
+            than the target takes. Or the datastore is of another target. Or no end-effector path is curved.
         KervError: No decode of a task compared a draft with the target, so K_S is unknown.
         StorageError: The disk cannot be written.
     """

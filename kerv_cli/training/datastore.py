@@ -46,10 +46,10 @@ def build_datastore(
         The folder and the datastore.
 
     Raises:
-        CheckpointError: The target or the demonstrations do not exist. Or the demonstrations are of another
-            environment, contain evaluation seeds, have no episode of a task, have too few actions of the expert, or
-            hold images of another size than the target takes.
-        UsageError: `key` is empty. Or the folder holds something else than a datastore.
+        CheckpointError: The demonstrations do not exist, are of another environment, contain evaluation seeds, have no
+            episode of a task, have too few actions of the expert, or hold images of another size than the target takes.
+        UsageError: The target does not exist, or `key` is empty. Or the folder holds something else than a datastore.
+            Or the datastore of a shipped policy would be replaced.
         UnknownName: `key` names an unknown part of the prompt.
         StorageError: The disk cannot be written.
     """

@@ -113,7 +113,7 @@ def demos_for(settings: S, target: TargetDescription, database: Database) -> tup
 
     Raises:
         CheckpointError: The demonstrations are missing, unfinished, damaged, of another environment, or show other
-            camera views than the target sees.
+            camera views than the target sees. Or they hold no episode of a task.
     """
     name, tasks = settings.demos or target.demos or name_of(()), settings.task
     if settings.demos:
@@ -312,8 +312,9 @@ def recording_of(settings: DemosSettings) -> tuple[DemoConfig, PolicyActs | None
 
     Raises:
         UnknownName: A task does not exist.
-        UsageError: `policy.target` is set although the expert acts.
-        CheckpointError: The policy does not exist.
+        UsageError: `policy.target` is set although the expert acts. Or the policy does not exist or cannot act, see
+            `PolicyActs.of`.
+        CheckpointError: An artifact is missing or damaged, or the policy is of another environment.
     """
     tasks, target = resolve_tasks(settings.task), settings.policy.target
     actor = None

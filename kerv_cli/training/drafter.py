@@ -39,10 +39,14 @@ def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Beg
         The drafter's folder, and the metrics of the best weights.
 
     Raises:
-        UnknownName: The kind of drafter does not exist.
-        CheckpointError: The target or the demonstrations do not exist or are damaged. Or the folder holds another
-            training.
+        UnknownName: The kind of drafter or a task does not exist.
+        UsageError: The target does not exist, does not decode token by token, or has tokens that this drafter cannot
+            learn. Or the drafter of a shipped policy would be replaced.
+        CheckpointError: The target is damaged, or the demonstrations are missing or damaged. Or the folder holds
+            another training.
         KervError: The training diverged.
+        StorageError: The disk cannot be written.
+        Interrupted: The process got Ctrl-C or SIGTERM. The state of the training is saved.
     """
     drafter: TrainableDrafter = find("drafter", settings.drafter.kind, "drafter.kind").built()
     artifacts, train = Artifacts(settings.results, settings.policy), settings.train
@@ -101,8 +105,8 @@ def import_drafter(settings: BuildDrafterSettings) -> tuple[Path, dict[str, Any]
         The drafter's folder, and numbers to print: parameters, layers, positions and mask.
 
     Raises:
-        UsageError: The drafter of a shipped policy would be replaced.
-        CheckpointError: The target does not exist. Or the drafter is incomplete, damaged, pickled or of another width.
+        UsageError: The target does not exist. Or the drafter of a shipped policy would be replaced.
+        CheckpointError: The target is damaged. Or the drafter is incomplete, damaged, pickled or of another width.
     """
     convention = Convention(settings.positions, settings.mask)
     device, _ = set_up(settings.runtime)

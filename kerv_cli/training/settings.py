@@ -132,7 +132,11 @@ class TrainDrafterSettings(DemonstrationSettings):
     train: TrainSettings = setting(TrainSettings, "optimisation")
 
     def check_together(self, prefix: str) -> None:
-        """Refuse optimisation settings that only the training of a target reads."""
+        """Refuse optimisation settings that only the training of a target reads.
+
+        Raises:
+            UsageError: Such a setting differs from its default.
+        """
         unused = ("init", "balance", "closed_loop", "colour", "places")
         refuse_unused(self.train, unused, ": only the training of a target has this setting")
 

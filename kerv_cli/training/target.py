@@ -67,10 +67,12 @@ def train_target(settings: TrainTargetSettings, database: Database, begin: Begin
         The target's folder, and the metrics of the best weights.
 
     Raises:
-        UsageError: Some settings contradict each other.
-        CheckpointError: The demonstrations or the target `train.init` do not exist or are damaged. Or the
-            demonstrations have another environment, camera or other tasks. Or the folder holds another training.
+        UsageError: Some settings contradict each other, or the target `train.init` does not exist.
+        CheckpointError: The demonstrations are missing or damaged, or have another environment, camera or other tasks.
+            Or the target `train.init` is damaged. Or the folder holds another training.
         KervError: The training diverged.
+        StorageError: The disk cannot be written.
+        Interrupted: The process got Ctrl-C or SIGTERM. The state of the training is saved.
     """
     folder, train = artifact(settings.results, "target", settings.name), settings.train
     refuse_contradictions(settings)
@@ -182,8 +184,9 @@ def initial_target(settings: TrainTargetSettings, camera: str, new: Path) -> Pat
         new: Folder of the new target.
 
     Raises:
-        UsageError: The training would overwrite that target, or that target has other shapes than the new one.
-        CheckpointError: The target `train.init` does not exist.
+        UsageError: The target `train.init` does not exist, or the training would overwrite it. Or it has another camera
+            or other shapes than the new one.
+        CheckpointError: The target `train.init` is damaged.
     """
     name = settings.train.init
     if name is None:

@@ -84,7 +84,7 @@ class MetaWorld(StepBenchmark):
         return [{"name": t.name, "suite": t.difficulty, "instruction": t.instruction, "seed": self.seed} for t in tasks]
 
     def reset(self, task: dict[str, Any]) -> Observation:
-        """Start the episode number `episode_idx` of a task."""
+        """Start episode number `episode_idx` of a task."""
         if self.world is None or self.world.task != task["name"]:
             self.cleanup()
             self.world = self.spec.open_world(task["name"], self.camera, self.horizon)

@@ -299,7 +299,8 @@ class EarlyDrafter(TrainableDrafter):
     def validate(self, network: Any, target: Any, held_out: Any, settings: Any) -> Metrics:
         """Return metrics that compare drafts of held-out observations with the target's tokens.
 
-        All perturbed episodes (executed with noise) together weigh as much as all other episodes together.
+        All perturbed episodes (executed with noise) together weigh as much as all other episodes together. The score is
+        the mean number of accepted tokens with strict acceptance, plus the same with the acceptance radius 9.
         """
         chosen = torch.arange(len(held_out)).split(256)
         outputs = [self.outputs(network, target, held_out.where(indices)) for indices in chosen]

@@ -249,7 +249,7 @@ class ScheduleThresholdSettings(RadiusRange):
 
 
 class Variable(Threshold):
-    """KERV: the acceptance radius r follows the variability K, the mean distance of draft tokens to target tokens.
+    """KERV: the acceptance radius r follows the variability K, the distance of draft tokens to target tokens.
 
     After each decode that compared drafts, r becomes, with f(x) = r_min + (r_max − r_min) · exp(−(x / K_S)^φ) and the
     change ΔK since the last such decode:
@@ -259,7 +259,8 @@ class Variable(Threshold):
     - `offset` (KERV's README): f(|ΔK|). So r is large while K is steady.
     - `quoted` (arXiv 2603.01581): r + f(|ΔK|) − r_min. r never shrinks: it rises from r_min to r_max and stays.
 
-    r is limited to r_min … r_max. An episode begins as if K had been K_S. K_S is the task's reference level.
+    r is limited to r_min … r_max. K_S is the task's reference level. An episode begins with r = f(K_S), for `quoted`
+    with r = r_min. The first ΔK is K − K_S.
 
     Attributes:
         r: The radius of the next decode, in bins, not rounded.
@@ -285,7 +286,7 @@ class Variable(Threshold):
         self.reset()
 
     def reset(self) -> None:
-        """Begin an episode, as if the last decode's variability K was the reference level K_S."""
+        """Begin an episode with r = f(K_S), or for `quoted` with r = r_min. K_S counts as the last K."""
         self.last = self.k_s
         self.r = float(self.settings.r_min) if self.settings.kind == "quoted" else self.falling(self.k_s)
 

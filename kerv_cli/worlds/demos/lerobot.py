@@ -228,8 +228,9 @@ def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProg
         progress: Called after every episode.
 
     Raises:
-        UsageError: There is no LeRobot dataset, or the new folder exists already.
-        UnknownName: The dataset has no such camera or strict DoF.
+        UsageError: `settings.source` is a file, the new folder exists already, or the dataset does not fit the
+            settings.
+        UnknownName: There is no such environment, or the dataset has no such camera or strict DoF.
         CheckpointError: The dataset is damaged or of another version.
         KervError: The dataset contains videos, and the package av is not installed.
     """
