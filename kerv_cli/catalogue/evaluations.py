@@ -121,8 +121,8 @@ def import_evaluations(
         many are missing.
 
     Raises:
-        UsageError: A path holds no evaluation, the evaluations cannot be compared, another study has the same name, or
-            the baseline's label does not exist.
+        UsageError: A path holds no evaluation, the evaluations cannot be compared, a study that was not imported has
+            the same name, or the baseline's label does not exist.
         StorageError: The disk is full or not writable.
         CheckpointError: A file is damaged.
     """
@@ -156,7 +156,8 @@ def read_evaluations(path: Path) -> list[Evaluation]:
     """Read the evaluations in a recording, or in a folder of recordings. All must be from the same model server.
 
     Raises:
-        UsageError: There is no recording, no recording has an episode, or the recordings are from several servers.
+        UsageError: There is no recording, no recording has an episode, or the recordings are from several servers or
+            have several evaluations of one benchmark.
         CheckpointError: A file is damaged or incomplete.
     """
     files = sorted(path.glob("[!.]*.sqlite")) if path.is_dir() else [path]
@@ -327,7 +328,7 @@ def _identity(evaluations: Sequence[Evaluation]) -> dict[str, str]:
 def _imported(results: Path, episode: Episode, one: Evaluation, recorded: RecordedEpisode) -> ImportedEpisode:
     """Return an episode for the database, with its decodes if kerv served it.
 
-    vla-eval ran one setting after the other. So each evaluation is a block (episodes that one process ran) of its own.
+    The settings were not run alternately. So each evaluation is a block (episodes that one process ran) of its own.
 
     Args:
         results: The results folder, which holds the served episodes.

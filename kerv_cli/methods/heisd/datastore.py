@@ -297,7 +297,11 @@ class DatastoreArtifact(Artifact[Manifest]):
         return path / MANIFEST
 
     def read(self, path: Path) -> Manifest:
-        """Read the manifest, and check that all its seeds are training seeds."""
+        """Read the manifest, and check that all its seeds are training seeds.
+
+        Raises:
+            CheckpointError: The manifest is missing or damaged, or a seed is not a training seed.
+        """
         manifest = super().read(path)
         check_seeds({task: shard.seeds for task, shard in manifest.tasks.items()}, path)
         return manifest

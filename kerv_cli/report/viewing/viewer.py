@@ -78,7 +78,7 @@ def open_recording(paths: Sequence[Path]) -> str:
         A sentence about what was opened. Without a display: the commands to type on another machine.
 
     Raises:
-        KervError: A recording is damaged, or the viewer did not start.
+        KervError: A recording is damaged, Rerun is not installed, or the viewer did not start.
     """
     chosen = paths[:MOST_OPENED]
     for path in chosen:
@@ -172,7 +172,7 @@ def film_of(path: Path) -> Film:
     """Read the images of a recording. The latest four recordings are kept in memory.
 
     Raises:
-        KervError: The recording is missing or damaged.
+        KervError: The recording is missing or damaged, or Rerun is not installed.
     """
     changed = path.stat().st_mtime_ns if path.exists() else 0
     return _read(path, changed)

@@ -301,7 +301,8 @@ class Program:
             positions: (T,) rotary positions. None if the program has no attention.
             cache: Keys and values of earlier tokens. None: there are no earlier tokens.
             mask: Result of `attention_mask`. None: attention is causal.
-            results: (times, 1, B) float32, filled with the result of each execution. None: execute once.
+            results: (times, 1, B) float32, or (levels, 4, top_k²) for `grow`. It is filled with the results of each
+                execution. None: execute once.
             end: Result after which to stop. None: stop only after the last execution.
 
         Raises:

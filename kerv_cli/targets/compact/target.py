@@ -181,6 +181,7 @@ class CompactTarget(Compilable):
         Raises:
             CheckpointError: Proprioception, state or image has a different size than in training, or the image is
                 missing.
+            UsageError: The instruction has too many words.
         """
         proprioception = upload(np.asarray(observation.proprioception, dtype=np.float32), self.device)[None]
         state = upload(np.asarray(observation.state, dtype=np.float32), self.device)[None]
@@ -210,6 +211,7 @@ class CompactTarget(Compilable):
 
         Raises:
             CheckpointError: The observation does not fit the target, see `inputs`.
+            UsageError: The instruction has too many words.
         """
         inputs = self.inputs(observation)
         prompt, places = self.encode_batch(inputs)
@@ -221,6 +223,7 @@ class CompactTarget(Compilable):
 
         Raises:
             CheckpointError: An observation does not fit the target, see `inputs`.
+            UsageError: An instruction has too many words.
         """
         columns: Any = zip(*(vars(inputs).values() for inputs in map(self.inputs, observations)), strict=True)
         joined: Any = (None if column[0] is None else torch.cat(column) for column in columns)
