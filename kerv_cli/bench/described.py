@@ -142,7 +142,7 @@ def _of_model(settings: EstimateSettings) -> Described:
     """Return the policy of `settings.model`: a shape's name, a `config.json`, its folder, or a target of kerv.
 
     Raises:
-        UsageError: The target's description states no width.
+        UsageError: There is no such target, or its description states no width.
         CheckpointError: The file does not describe a policy.
     """
     name = settings.model

@@ -1,4 +1,4 @@
-"""Decodes the observations of several episodes at once, for runs that measure success but no times.
+"""Decode the observations of several episodes at once, for runs that measure success but no times.
 
 Only methods that never verify a draft can be batched (docs/measuring.md).
 
