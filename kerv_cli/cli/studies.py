@@ -122,19 +122,20 @@ def _plan_rows(planned: Study) -> list[dict[str, object]]:
 
     rows: list[dict[str, object]] = []
     for label in planned.labels:
-        episodes = [one for one in planned.episodes if one.setting.label == label]
-        reasons = [planned.missing[one] for one in episodes if one in planned.missing]
-        rows.append(
-            {
-                "setting": label,
-                "to run": len(reasons),
-                "reused": len(episodes) - len(reasons),
-                "tasks": len({one.task for one in episodes}),
-                "seeds": seeds_text(one.seed for one in episodes),
-                "repeats": len({one.repeat for one in episodes}),
-                "why": "; ".join(dict.fromkeys(reasons)),
-            }
-        )
+        reasons, reused = [], 0
+        tasks, seeds, repeats = set(), set(), set()
+        for one in planned.episodes:
+            if one.setting.label == label:
+                tasks.add(one.task)
+                seeds.add(one.seed)
+                repeats.add(one.repeat)
+                if one in planned.missing:
+                    reasons.append(planned.missing[one])
+                else:
+                    reused += 1
+        numbers = {"to run": len(reasons), "reused": reused, "tasks": len(tasks)}
+        rows.append({"setting": label, **numbers, "seeds": seeds_text(seeds), "repeats": len(repeats),
+                     "why": "; ".join(dict.fromkeys(reasons))})  # fmt: skip
     return rows
 
 

@@ -6,6 +6,7 @@ Ties go to the path with the smaller summed distance to the target tokens, then 
 
 from __future__ import annotations
 
+import itertools
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -128,7 +129,7 @@ class DistanceRule(Buildable):
             r: Acceptance radius, in bins.
         """
         limits = self.limits(r)
-        alone = [(dof, dof + 1) for dof in range(len(limits))]  # every DoF is a group of its own
+        alone = list(itertools.pairwise(range(len(limits) + 1)))  # every DoF is a group of its own
         return accept_by_group(tree, target_tokens, start, limits, group_limit=max(limits), bounds=alone)
 
     def judge_after(self, tokens: Sequence[int], tree: TokenTree, target_tokens: Sequence[int], r: int) -> Accepted:

@@ -74,7 +74,7 @@ class BatchDecoder:
         """
         if isinstance(self.target, EncodesMany) and self.target.device.type != "cpu":
             return list(self.target.encode_many(observations).split(1))
-        return [self.target.encode(observation) for observation in observations]
+        return list(map(self.target.encode, observations))
 
     def _cache(self, rows: int) -> Cache:
         """Return an empty cache for `rows` sequences.

@@ -35,7 +35,7 @@ def read(*parts: Tensor) -> list[np.ndarray]:
     Returns:
         One array per vector.
     """
-    sizes, together = [part.shape[0] for part in parts], parts[0]
+    sizes, together = list(map(len, parts)), parts[0]
     if len(parts) > 1:
         mixed = len({part.dtype for part in parts}) > 1
         together = torch.cat([*map(Tensor.double, parts)] if mixed else parts)

@@ -38,13 +38,14 @@ def repeating_words(settings: Plain, identity: Identity, typed: str, task: str, 
     words = [_first_word(settings, typed)]
     now = composed()
     # parts first: which other keys exist depends on them
-    words += [
-        f"{group}={settings[group]['kind']}"
-        for group in PART_GROUPS
-        if group in settings and settings[group]["kind"] != now[group]["kind"]
-    ]
+    for group in PART_GROUPS:
+        kind = settings[group]["kind"] if group in settings else now[group]["kind"]
+        if kind != now[group]["kind"]:
+            words.append(f"{group}={kind}")
     have = _keys(composed())
-    words += [f"{key}={_text(value)}" for key, value in _keys(settings).items() if have.get(key) != value]
+    for key, value in _keys(settings).items():
+        if have.get(key) != value:
+            words.append(f"{key}={_text(value)}")
     if work_of(composed(), identity) != work_of(settings, identity):
         raise UsageError("the presets in conf/ have changed since: no command gives these settings any more")
     return ["rollout", *words, *place]

@@ -47,14 +47,20 @@ class Point:
             overrides: The point's overrides, `key=value`.
             varied: Keys that differ within the grid.
         """
-        pairs = [override.lstrip("+").split("=", 1) for override in overrides]
-        return cls(name, tuple(overrides), {key: value for key, value in pairs if key in varied})
+        varies = {}
+        for override in overrides:
+            key, value = override.lstrip("+").split("=", 1)
+            if key in varied:
+                varies[key] = value
+        return cls(name, tuple(overrides), varies)
 
     @property
     def label(self) -> str:
         """The grid's name and the point's values, such as `spec_vla r=3`."""
-        values = [f"{key.rpartition('.')[2]}={value}" for key, value in self.varies.items()]
-        return check_label(" ".join([self.name, *values]))
+        words = [self.name]
+        for key, value in self.varies.items():
+            words.append(f"{key.rpartition('.')[2]}={value}")
+        return check_label(" ".join(words))
 
 
 @dataclass(frozen=True)
@@ -110,8 +116,13 @@ def resolve(
         UsageError: A key or name is unknown. Or the study has no settings or lacks its baseline. Or one of its settings
             sets a key that the command line sets, too. Or a label is empty, too long or not one line.
     """
-    of_sweep = [o for o in overrides if _key(o).split(".")[0] in schema.__dataclass_fields__]
-    of_settings = [o for o in overrides if o not in of_sweep or o.startswith("results=")]
+    of_sweep, of_settings = [], []
+    for override in overrides:
+        is_of_sweep = _key(override).split(".")[0] in schema.__dataclass_fields__
+        if is_of_sweep:
+            of_sweep.append(override)
+        if not is_of_sweep or override.startswith("results="):
+            of_settings.append(override)
     sweep = compose(command, of_sweep, schema)
     files = dict(override.split("=", 1) for override in of_sweep)
     study, path = sweep.study, preset_file("study", files.get("study", schema.groups["study"]))

@@ -195,11 +195,16 @@ class Study:
         Args:
             overrides: Further overrides to append.
         """
-        typed = (row.command for row in run_rows(self.database, SWEEP, self.name) if row.command[:1] == ("sweep",))
-        words: Iterable[str] = next(typed, ("sweep", f"study={self.name}"))
-        replaced = {"results", "rerun", *(word.partition("=")[0] for word in overrides)}
-        words = (word for word in words if word.partition("=")[0] not in replaced and not word.startswith("-"))
-        return shlex.join(["kerv", *words, *overrides, *self.database.words])
+        typed: Sequence[str] = ("sweep", f"study={self.name}")
+        for row in run_rows(self.database, SWEEP, self.name):
+            if row.command[:1] == ("sweep",):
+                typed = row.command
+                break
+        replaced = {"results", "rerun"}
+        for word in overrides:
+            replaced.add(word.partition("=")[0])
+        kept = [word for word in typed if word.partition("=")[0] not in replaced and not word.startswith("-")]
+        return shlex.join(["kerv", *kept, *overrides, *self.database.words])
 
     def load(self) -> Study:
         """Return the study as it was planned last.
@@ -383,9 +388,8 @@ class Study:
             frame["decode_seconds"] = frame["decode_seconds"].map(lambda blob: np.frombuffer(blob, "<f8"))
             about = pd.DataFrame(list(frame.pop("about")), index=frame.index)
         if episodes is not None:
-            chosen = {(one.setting.label, one.task, one.seed, one.repeat) for one in episodes}
-            keys = frame[["label", "task", "seed", "repeat"]].itertuples(index=False, name=None)
-            mine = [key in chosen for key in keys]
+            chosen = [(one.setting.label, one.task, one.seed, one.repeat) for one in episodes]
+            mine = pd.MultiIndex.from_frame(frame[["label", "task", "seed", "repeat"]]).isin(chosen)
             frame, about = frame[mine], about[mine]
         return pd.concat([frame, about], axis=1).reset_index(drop=True)
 

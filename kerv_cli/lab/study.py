@@ -236,8 +236,7 @@ class Progress:
             (self.outcome.reused if event.elsewhere else self.outcome.done).append(one)
             self.record.beat(len(self.outcome.done))
         elif isinstance(event, SettingFailed):
-            known = (self._missing.pop(one.key, one) for one in event.episodes)
-            event = replace(event, episodes=tuple(known))
+            event = replace(event, episodes=tuple(self._missing.pop(one.key, one) for one in event.episodes))
             self.outcome.failed.append(event)
         elif isinstance(event, BlockStarted):
             self.look()
@@ -330,10 +329,14 @@ class TimeLeft:
         query = sa.select(EPISODES.c.work, sa.func.avg(EPISODES.c.wall_seconds), sa.func.count(EPISODES.c.wall_seconds))
         with study.database.reading() as connection:
             rows = connection.execute(query.where(EPISODES.c.work.in_(works)).group_by(EPISODES.c.work)).all()
-        self._stored = {work: float(mean) for work, mean, _ in rows if mean is not None}
+        self._stored: dict[str, float] = {}
+        stored = 0
+        for key, mean, number in rows:
+            stored += number
+            if mean is not None:
+                self._stored[key] = float(mean)
         self._ended: Counter[str] = Counter()
         self._measured: defaultdict[str, float] = defaultdict(float)  # seconds of those that ended, by setting
-        stored = sum(number for *_, number in rows)
         self.source = f"measured on {stored} stored episodes" if stored else f"a guess of {guess:g} s per episode"
 
     def see(self, event: Event) -> None:
@@ -344,11 +347,17 @@ class TimeLeft:
                 self._ended[event.episode.setting.work] += 1
                 self._measured[event.episode.setting.work] += event.seconds
         elif isinstance(event, SettingFailed):
-            self._waiting.subtract(one.setting.work for one in event.episodes)
+            for one in event.episodes:
+                self._waiting[one.setting.work] -= 1
 
     @property
     def seconds(self) -> float:
         """Estimated seconds until every planned episode has ended or failed."""
-        means = self._stored | {work: self._measured[work] / number for work, number in self._ended.items()}
+        means = dict(self._stored)
+        for key, number in self._ended.items():
+            means[key] = self._measured[key] / number
         mean = sum(means.values()) / len(means) if means else self._guess
-        return sum(number * means.get(work, mean) for work, number in self._waiting.items()) / self.workers
+        seconds = 0.0
+        for key, number in self._waiting.items():
+            seconds += number * means.get(key, mean)
+        return seconds / self.workers

@@ -288,7 +288,9 @@ class Queue:
                 if tasks.issubset(study.tasks) and not is_running(connection, row.run):
                     connection.execute(sa.delete(QUEUE).where(QUEUE.c.id == row.id))
             common = {"study_id": number, "run": self.run, "newest": study.newest, "about": about}
-            rows = [{**common, "position": place, "episodes": block.keys} for place, block in enumerate(study.blocks)]
+            rows = []
+            for position, block in enumerate(study.blocks):
+                rows.append({**common, "position": position, "episodes": block.keys})
             if rows:
                 connection.execute(sa.insert(QUEUE), rows)
 
@@ -639,13 +641,17 @@ class _Attempt:
         """
         if isinstance(failure.error, StorageError | ClaimLost):
             raise failure.error
-        same = [other for other in self.left if (other.setting.work, other.task) == (one.setting.work, one.task)]
+        same: list[Episode] = []
+        others: list[Episode] = []
+        for other in self.left:
+            is_same = (other.setting.work, other.task) == (one.setting.work, one.task)
+            (same if is_same else others).append(other)
         if not same:
             return
         same.sort(key=lambda other: other is not one)
         self.failed += same
         patiently(self._write_failure, same, failure)
-        self.left = [other for other in self.left if other not in same]
+        self.left = others
         failure = replace(failure, episodes=tuple(same))
         self.on_event(failure)
 

@@ -77,7 +77,7 @@ def gpus_in_turn(device: str) -> list[str]:
         return [one.strip() for one in visible.split(",") if one.strip()]
     import torch
 
-    return [str(number) for number in range(torch.cuda.device_count())]
+    return list(map(str, range(torch.cuda.device_count())))
 
 
 def disturbances(study: Study) -> list[str]:
@@ -126,7 +126,7 @@ class LocalWorkers:
         self._workers: list[_Worker] = []
 
     def __enter__(self) -> LocalWorkers:
-        self._workers = [self._started(gpu) for gpu in self._gpus]
+        self._workers = list(map(self._started, self._gpus))
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -246,7 +246,7 @@ class Array:
             **({"partition": options.partition} if options.partition else {}),
         }
         script = "\n".join(["#!/bin/sh", *options.setup, f"exec {shlex.join(words)}", ""])
-        flags = [f"--{key}={value}" for key, value in asked.items()]
+        flags = list(map("--{}={}".format, asked, asked.values()))
         printed = _ask("sbatch", "--parsable", "--requeue", *flags, text=script, environment=environment)
         return printed.strip().partition(";")[0]
 
