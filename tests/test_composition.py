@@ -109,6 +109,7 @@ def test_settings_survive_a_file(method):
         ("proposer.kind=nope", "proposer.kind 'nope'"),
         ("proposer=drafter proposer.kind=hold", "choose proposer=hold"),
         ("rectifier=compensate rectifier.predictor=nope", "rectifier.predictor 'nope'"),
+        ("rectifier=compensate rectifier.predictor=early", "rectifier.predictor 'early'"),
         ("rectifier=compensate_draft rectifier.use_target_token=false", "leave rectifier.use_target_token=true"),
         ("skip=always", "skip=always with prefill_draft=none: it executes a draft from before the prefill"),
         ("method=spec_vla proposer.depth=0", "proposer.depth=0"),

@@ -123,7 +123,7 @@ class Part:
     @classmethod
     def every(cls) -> Mapping[str, Self]:
         """Return all registered parts of this class by name, in the order of registration."""
-        return cast(Mapping[str, Self], parts(cls.kind))
+        return {name: part for name, part in parts(cls.kind).items() if isinstance(part, cls)}
 
     @classmethod
     def find(cls, name: str, what: str = "") -> Self:
