@@ -73,7 +73,8 @@ class Command(Part):
     @property
     def shown(self) -> list[str]:
         """Names of the settings that `--help` lists. `store` comes after `results`."""
-        return re.sub(r"\bresults\b", "results store", self.keys).split()
+        keys = "" if self.settings is NoSettings else self.keys
+        return re.sub(r"\bresults\b", "results store", keys).split()
 
 
 command = Command
