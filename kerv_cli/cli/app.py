@@ -6,6 +6,7 @@ Each of kerv's own commands is in a file of this folder, which is imported when 
 from __future__ import annotations
 
 import os
+import textwrap
 from typing import Annotated, Any
 
 import typer
@@ -47,6 +48,13 @@ class Commands(FastFlags, TyperGroup):
         family = Commands(name=cmd_name, help=help, short_help=help, no_args_is_help=True, rich_markup_mode=None)
         family.context_settings, family.prefix = CONTEXT, f"{name} "
         return family
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
+        """Complete the name of a command. A description stays on one line: fish completes each line of the answer."""
+        found: list[Any] = super().shell_complete(ctx, incomplete)
+        for one in found:
+            one.help = one.help and textwrap.shorten(one.help, 45, placeholder=" …")
+        return found
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         """Find the command that the arguments begin with. Names of two words, as in `demos import`, are tried first.
