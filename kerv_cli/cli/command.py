@@ -16,6 +16,7 @@ import inspect
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import Field, dataclass, field, fields
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, cast
 
@@ -267,10 +268,10 @@ class CommandWithSettings(FastFlags, TyperCommand):
         """Add the most used settings, the subcommands and the examples to the help."""
         below = commands(self.part.name)
         below.pop(self.part.name, None)
+        has_cfg = "cfg" in map(attrgetter("name"), self.params)
+        every = f" (all of them: kerv {self.part.name} --cfg)" if has_cfg else ""
         sections: dict[str, list[tuple[str, str]]] = {
-            f"Settings, with their defaults (all of them: kerv {self.part.name} --cfg)": [
-                _row(self.part, key) for key in self.part.shown
-            ],
+            f"Settings, with their defaults{every}": [_row(self.part, key) for key in self.part.shown],
             "Commands": [(name, part.summary) for name, part in below.items()],
         }
         for title, rows in sections.items():
