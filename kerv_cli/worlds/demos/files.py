@@ -157,7 +157,7 @@ def load_episode(path: Path) -> DemoEpisode:
             frames=EncodedFrames([path], spans, height, int(metadata.get("frame_width", height))),
             **arrays,
         )
-    except (OSError, SafetensorError, KeyError, ValueError) as error:
+    except (OSError, SafetensorError, LookupError, ValueError) as error:
         raise CheckpointError(f"{path} is missing or damaged: {error}") from error
 
 
