@@ -259,8 +259,6 @@ def progress_bar(title: str, record: Run | None = None, has_estimate: bool = Fal
     Yields:
         `advance(done, total, text="")`. Call it to move the bar and to change the text after it.
     """
-    from rich import progress as bars
-
     on_terminal = sys.stderr.isatty()
     latest = -1
 
@@ -275,11 +273,15 @@ def progress_bar(title: str, record: Run | None = None, has_estimate: bool = Fal
             latest = tenths
             typer.echo(", ".join(filter(None, (f"{title} {done}/{total}", text))), err=True)
 
+    if not on_terminal:
+        yield advance
+        return
+    from rich import progress as bars
+
     timed = [bars.BarColumn(), bars.MofNCompleteColumn(), bars.TimeElapsedColumn()]
     timed += [] if has_estimate else [bars.TimeRemainingColumn()]
     name, extra = map(partial(bars.TextColumn, markup=False), ("{task.description}", "{task.fields[text]}"))
-    shown: Any = {"console": console(stderr=True), "transient": True, "disable": not on_terminal}
-    with bars.Progress(name, *timed, extra, **shown) as bar:
+    with bars.Progress(name, *timed, extra, console=console(stderr=True), transient=True) as bar:
         task = bar.add_task(title, total=None, text="")
         yield advance
 
