@@ -138,3 +138,6 @@ def test_tokens_of_a_code_are_shown_by_their_place_alone():
         assert len(rows.splitlines()) == len(record.tokens)
     bins = Decoder(MockTarget(SEVEN, 4, seed=2)).decode(shown(1))
     assert token_names([bins], SEVEN.names) == SEVEN.names
+    alone = replace(bins, actions=bins.actions[:, :1], tokens=bins.tokens[: len(bins.actions)])
+    size = chunk_size([alone], 1)
+    assert "| step | DoF |" in decode_table(alone, 0, 0, outcomes_of(alone, size, 1), ["x"]), "one DoF is no code"

@@ -230,9 +230,9 @@ def decode_table(
         number: Number of the decode in the episode, from 0.
         step: Control step at which its first action is executed.
         outcomes: Outcome of each token of its chunk.
-        names: Names of the D DoFs, or one name for tokens of a code, which belong to no step and DoF.
+        names: Names of a control step's tokens, from `token_names`.
     """
-    is_coded = len(names) == 1
+    is_coded = _is_coded(decode, len(names))
     counts = {
         "forwards": decode.forwards,
         "verifications": decode.verifications,
