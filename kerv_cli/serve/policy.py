@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import contextlib
 import math
 import threading
 from dataclasses import asdict, fields
@@ -92,9 +93,9 @@ class Policy:
 
     def lend_decoder(self, task: str) -> Decoder:
         """Return a decoder for a new client. A new decoder is warmed up."""
+        with contextlib.suppress(IndexError):  # two clients may connect at once
+            return self._idle.pop()
         with self._turn:
-            if self._idle:
-                return self._idle.pop()
             decoder = self.method.decoder(self.artifacts.target, self.artifacts.load, task)
             decoder.target = Finite(decoder.target)
             warm_up(decoder, task, self.interface.observation, self.interface.size, WARM_UP)
