@@ -10,9 +10,9 @@ from types import FrameType
 
 def main() -> None:
     """Run the command `kerv`. SIGTERM, which schedulers and `timeout` send, has the same effect as Ctrl-C."""
-    # a stream is None if the shell has closed it (`>&-`)
-    nowhere = open(os.devnull, "w")  # noqa: SIM115 - it stays open
-    sys.stdout, sys.stderr = sys.stdout or nowhere, sys.stderr or nowhere
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # the shell has closed it (`>&-`)
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 - it stays open
     # a signal that is ignored stays ignored: nohup, or a shell's job in the background
     ours = [number for number in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(number) is not signal.SIG_IGN]
     for number in ours:
@@ -36,8 +36,8 @@ _UNSAFE = ("<frozen importlib", f"{os.sep}sqlalchemy{os.sep}pool{os.sep}")
 process, if C++ code is running Python. SQLAlchemy's pool prints the traceback of an exception that interrupts it."""
 _WAIT_SECONDS = 3.0
 """Longest wait for the end of such code. Some takes much longer: the import that compiles for this CPU."""
-_asked: list[float] = []
-"""Times at which a signal came while such code ran, seconds."""
+_deadline = 0.0
+"""Time at which such code is ended, seconds. 0: no signal came while it ran."""
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
@@ -45,11 +45,11 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
     If that code goes on for too long, end the process at once. The database shows its command as interrupted then.
     """
-    now = time.monotonic()
+    global _deadline
     while frame is not None:
         if any(part in frame.f_code.co_filename for part in _UNSAFE):
-            _asked.append(now)
-            if now - _asked[0] > _WAIT_SECONDS:
+            _deadline = _deadline or time.monotonic() + _WAIT_SECONDS
+            if time.monotonic() > _deadline:
                 _end(number, frame)
             _ask_again(number)
             return
