@@ -318,7 +318,9 @@ def study_parts(report: Report) -> dict[str, Any]:
     if not answer.startswith(tuple(row.label for row in rows)):  # a label stays as it is
         answer = answer[:1].upper() + answer[1:]
     return {
-        "of": study,
+        # not the study itself: the board keeps these values, and the episodes of many studies would fill its memory
+        "of": {name: getattr(study, name) for name in ("name", "title", "note", "baseline")},
+        "wanted": len(study.episodes),
         "about": f"{about(rows)} · kerv {first['kerv_version']} at {first['git_commit'][:12]}",
         "question": question(rows, report.loss),
         "verdict": report.verdict,
