@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import typer
@@ -118,24 +119,24 @@ def print_study_plan(planned: Study, as_json: bool, guess: float = SECONDS_PER_E
 
 def _plan_rows(planned: Study) -> list[dict[str, object]]:
     """Return one table row per setting: numbers of missing and existing episodes, and why episodes will run."""
-    from kerv_cli.lab.plan import seeds_text
+    from kerv_cli.lab.plan import grouped, seeds_text
 
+    of_label = grouped(planned.episodes, attrgetter("setting.label"))
     rows: list[dict[str, object]] = []
     for label in planned.labels:
-        reasons, reused = [], 0
-        tasks, seeds, repeats = set(), set(), set()
-        for one in planned.episodes:
-            if one.setting.label == label:
-                tasks.add(one.task)
-                seeds.add(one.seed)
-                repeats.add(one.repeat)
-                if one in planned.missing:
-                    reasons.append(planned.missing[one])
-                else:
-                    reused += 1
-        numbers = {"to run": len(reasons), "reused": reused, "tasks": len(tasks)}
-        rows.append({"setting": label, **numbers, "seeds": seeds_text(seeds), "repeats": len(repeats),
-                     "why": "; ".join(dict.fromkeys(reasons))})  # fmt: skip
+        episodes = of_label[label]
+        reasons = [planned.missing[one] for one in episodes if one in planned.missing]
+        rows.append(
+            {
+                "setting": label,
+                "to run": len(reasons),
+                "reused": len(episodes) - len(reasons),
+                "tasks": len(set(map(attrgetter("task"), episodes))),
+                "seeds": seeds_text(map(attrgetter("seed"), episodes)),
+                "repeats": len(set(map(attrgetter("repeat"), episodes))),
+                "why": "; ".join(dict.fromkeys(reasons)),
+            }
+        )
     return rows
 
 

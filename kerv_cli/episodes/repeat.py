@@ -38,10 +38,8 @@ def repeating_words(settings: Plain, identity: Identity, typed: str, task: str, 
     words = [_first_word(settings, typed)]
     now = composed()
     # parts first: which other keys exist depends on them
-    for group in PART_GROUPS:
-        kind = settings[group]["kind"] if group in settings else now[group]["kind"]
-        if kind != now[group]["kind"]:
-            words.append(f"{group}={kind}")
+    changed = [group for group in PART_GROUPS if group in settings and settings[group]["kind"] != now[group]["kind"]]
+    words += [f"{group}={settings[group]['kind']}" for group in changed]
     have = _keys(composed())
     for key, value in _keys(settings).items():
         if have.get(key) != value:

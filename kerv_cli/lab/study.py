@@ -347,8 +347,7 @@ class TimeLeft:
                 self._ended[event.episode.setting.work] += 1
                 self._measured[event.episode.setting.work] += event.seconds
         elif isinstance(event, SettingFailed):
-            for one in event.episodes:
-                self._waiting[one.setting.work] -= 1
+            self._waiting.subtract(one.setting.work for one in event.episodes)
 
     @property
     def seconds(self) -> float:
