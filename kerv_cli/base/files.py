@@ -38,7 +38,7 @@ OTHER_HOSTS_STALE_HOURS = 7 * 24.0
 """After this many hours a temporary file of another machine counts as left over by a killed process."""
 
 CLOCKS_DIFFER_SECONDS = 3600.0
-"""The clock of a network folder may be behind this machine's clock by this many seconds."""
+"""The clock of a network folder may be this many seconds behind this machine's clock."""
 
 _TEMPORARY = re.compile(r"\..+\.(?P<host>[^/]+?)\.(?P<pid>\d+)-[0-9a-f]{8}\.tmp")
 _OF_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM)

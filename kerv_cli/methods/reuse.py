@@ -1,6 +1,6 @@
 """Proposers that reuse known tokens: the target's last predictions (Jacobi), or the last chunk (prompt lookup).
 
-Jacobi decoding is that of PD-VLA, prompt lookup decoding that of Saxena (2023); both are in docs/methods.md §6.
+The Jacobi decoding is PD-VLA's, and the prompt lookup decoding is Saxena's (2023). docs/methods.md §6 describes both.
 """
 
 from __future__ import annotations

@@ -279,7 +279,7 @@ def measure(
         averaging: MACRO computes a measure for every difficulty group and returns the unweighted mean of the groups.
             MICRO and ONE_TASK pool the episodes of a setting. Paired counts, McNemar's p and `pairs_to_settle` are
             always pooled.
-        speeds: Speedups by group. None: those of `pairs`, from `speedups`.
+        speeds: Speedups by group. None: `speedups` computes them from `pairs`.
 
     Returns:
         The measures by group: by label, or with ONE_TASK by task and label.

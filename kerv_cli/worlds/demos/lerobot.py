@@ -192,8 +192,8 @@ class Source:
             table: The episode's rows.
 
         Raises:
-            CheckpointError: A file is missing or damaged. Or its images, those of earlier episodes included, take more
-                memory than its size allows.
+            CheckpointError: A file is missing or damaged. Or the images read from it so far, also for earlier episodes,
+                take more memory than its size allows.
         """
         count = len(table)
         if self.info["features"][self.key]["dtype"] == "image":
