@@ -192,7 +192,8 @@ def show_episode(request: Request) -> Response:
     """Show one episode. `?decode=N` chooses a decode."""
     found = _found(request)
     (decodes, steps), episode, row = found.decodes(), found.episode, found.row
-    names = token_names(decodes, _names(episode.task, decodes))
+    dofs = _names(episode.task, decodes)
+    names = token_names(decodes, dofs)
     size = chunk_size(decodes, len(names))
     chunks = [outcomes_of(decode, size, len(names)) for decode in decodes]
     counts = Counter(map(attrgetter("kind"), itertools.chain.from_iterable(chunks)))
@@ -204,6 +205,7 @@ def show_episode(request: Request) -> Response:
         "episode.html",
         decodes=list(zip(decodes, steps, chunks, strict=True)),
         names=names,
+        is_coded=names is not dofs,
         counts=counts,
         styles=OUTCOMES,
         phases={phase: row[f"seconds.{phase}"] for phase in PHASES if row[f"seconds.{phase}"]},
