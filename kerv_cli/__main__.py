@@ -3,7 +3,6 @@
 import os
 import signal
 import sys
-import threading
 import time
 from types import FrameType
 
@@ -31,9 +30,10 @@ def _end(number: int, frame: FrameType | None) -> None:
     os._exit(130)
 
 
-_UNSAFE = ("<frozen importlib", f"{os.sep}sqlalchemy{os.sep}pool{os.sep}")
+_UNSAFE = ("<frozen importlib", f"{os.sep}sqlalchemy{os.sep}", f"{os.sep}contextlib.py")
 """Code in files with these parts in their names must not be interrupted. An exception during an import can abort the
-process, if C++ code is running Python. SQLAlchemy's pool prints the traceback of an exception that interrupts it."""
+process, if C++ code is running Python. An exception in SQLAlchemy, or between a context manager's `yield` and the
+`with` block, can leave a transaction open. Then this process itself keeps the database locked."""
 _WAIT_SECONDS = 3.0
 """Longest wait for the end of such code. Some takes much longer: the import that compiles for this CPU."""
 _deadline = 0.0
@@ -76,10 +76,13 @@ def _unraisable_at_the_end(unraisable: "sys.UnraisableHookArgs") -> None:
 
 
 def _ask_again(number: int) -> None:
-    # sent to the main thread: if it waits for input, a signal to another thread would not wake it
-    timer = threading.Timer(0.05, signal.pthread_kill, (threading.main_thread().ident, number))
-    timer.daemon = True
-    timer.start()
+    """Send a signal again a few milliseconds later.
+
+    The kernel's timer sends it. A thread could do so only while the main thread waits in C code, which is always in the
+    same few places: the signal could come at a bad moment each time.
+    """
+    signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(number))
+    signal.setitimer(signal.ITIMER_REAL, 0.005)
 
 
 if __name__ == "__main__":

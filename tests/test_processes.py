@@ -65,6 +65,35 @@ def run():
 kerv_cli.cli.app.app = run
 kerv.main()
 """
+WRITER = """
+import random, signal, sys
+import kerv_cli.__main__ as kerv
+import kerv_cli.cli.app, kerv_cli.lab.database as lab
+import sqlalchemy as sa
+
+def insert(database, key):
+    with database.writing() as connection:
+        connection.execute(sa.insert(lab.ABOUT).values(key=key, value=""))
+
+def run():
+    lab.LOCK_SECONDS = 0.2
+    signal.signal(signal.SIGVTALRM, lambda *_: signal.raise_signal(signal.SIGINT))
+    for trial in range(200):
+        database, kerv._deadline = lab.Database(sys.argv[1]), 0.0
+        try:
+            signal.setitimer(signal.ITIMER_VIRTUAL, random.uniform(1e-4, 6e-3))
+            number = 0
+            while True:
+                insert(database, f"{trial} {number}")
+                number += sum(range(4000)) > 0  # safe code
+        except KeyboardInterrupt:
+            insert(database, f"{trial} interrupted")
+        database.close()
+    print("all written")
+
+kerv_cli.cli.app.app = run
+kerv.main()
+"""
 
 
 def ended(pid: int) -> bool:
@@ -144,3 +173,9 @@ def test_an_import_that_takes_long_is_ended(tmp_path):
     begun.send_signal(signal.SIGINT)
     assert begun.communicate(timeout=20) == ("", "kerv: interrupted\n")
     assert begun.returncode == 130
+
+
+def test_an_interrupt_leaves_no_transaction_open(tmp_path):
+    """Otherwise the command itself would wait for the lock, and lose what it has written."""
+    run = subprocess.run([sys.executable, "-c", WRITER, str(tmp_path)], capture_output=True, text=True, timeout=60)
+    assert run.stdout == "all written\n", run.stderr

@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 
 import sqlalchemy as sa
 
+from kerv_cli.base.durations import count
 from kerv_cli.base.errors import Interrupted, KervError, StorageError, UsageError
 from kerv_cli.base.paths import check_writable
 from kerv_cli.base.runtime import set_up
@@ -204,7 +205,8 @@ def run_blocks(study: Study, prepare: Prepare, record: Run, on_event: OnEvent) -
 def _kept(study: Study) -> str:
     """Return how many episodes of a study are stored, as text. The text has no numbers if the database fails."""
     try:
-        return "{} of {} episodes".format(*study.counts())
+        done, total = study.counts()
+        return f"{done} of {count(total or len(study.episodes), 'episode')}"  # its plan may not be written yet
     except StorageError:
         return "all complete episodes"
 
