@@ -218,11 +218,12 @@ class Recorded:
     speed: float
 
 
-def nearest_table(tokens: int) -> str:
-    """Return the table whose chunks are nearest in length to `tokens` tokens."""
-    return min(TABLES, key=lambda name: abs(TABLES[name] - tokens))
+def nearest_tables(tokens: int) -> list[str]:
+    """Return the published tables, sorted by how close their chunks' length is to `tokens` tokens."""
+    return sorted(TABLES, key=lambda name: abs(TABLES[name] - tokens))
 
 
+@functools.cache
 def recorded(table: str) -> list[Recorded]:
     """Return the settings of a published table, AR first.
 

@@ -6,13 +6,13 @@ autoregressive decoding.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 from kerv_cli.bench.described import Described
-from kerv_cli.bench.expected import Decodes, Drafts, Recorded, nearest_table, recorded
+from kerv_cli.bench.expected import Decodes, Drafts, Recorded, nearest_tables, recorded
 from kerv_cli.bench.physics import DEVICES, ENGINES, ROOFLINE, SHAPES, Device, Engine, Shape, priced
 from kerv_cli.bench.settings import BenchSettings, EstimateSettings
 from kerv_cli.engine.cost import Profile
@@ -161,7 +161,7 @@ class Estimate:
     @cached_property
     def answers(self) -> list[Answer]:
         """The speeds of all families of methods that the profile can price."""
-        profile, table, answers = self.costs.profile, recorded(nearest_table(self.tokens)), []
+        profile, answers = self.costs.profile, []
         for family in FAMILIES:
             drafts, published, own, source, even = family.drafts, None, None, None, None
             if profile.lacks([drafts.source] if drafts.source else ["feed", "draft"]):
@@ -170,7 +170,7 @@ class Estimate:
             if family.length is not None:
                 paper = Decodes(profile, ACTION, drafts)
                 published = best.speed([paper.acceptance_for(1 + (ACTION - 1) / family.length)])
-            if (shown := closest(table, family)) is not None:
+            if (shown := closest(self.tokens, family)) is not None:
                 chance = Decodes(profile, shown.tokens, shown.drafts).acceptance_for(shown.forwards)
                 own = Decodes(profile, self.tokens, shown.drafts).speed([chance])
                 source = f"results/tables/{shown.table}.csv, {shown.label}"
@@ -181,14 +181,17 @@ class Estimate:
         return answers
 
 
-def closest(table: Iterable[Recorded], family: Family) -> Recorded | None:
-    """Return the setting of a table that represents a family. None if no setting has the family's method.
+def closest(tokens: int, family: Family) -> Recorded | None:
+    """Return a published setting that has a family's method and drafts as the family does (a chain or a tree).
 
-    If several settings have the method, return the first that drafts as the family does (chain or tree). If none of
-    them does, return the first.
+    It is the first such setting of the table whose chunks have about `tokens` tokens. If that table has none, the other
+    tables are searched. None if no table has such a setting.
     """
-    of_method = filter(lambda one: one.method == family.method, table)
-    return max(of_method, key=lambda one: bool(one.drafts.nodes) == bool(family.drafts.nodes), default=None)
+    for table in nearest_tables(tokens):
+        for one in recorded(table):
+            if one.method == family.method and bool(one.drafts.nodes) == bool(family.drafts.nodes):
+                return one
+    return None
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kerv_cli.bench.expected import TABLES, nearest_table
+from kerv_cli.bench.expected import TABLES
 from kerv_cli.bench.physics import DEVICES
 from kerv_cli.bench.prices import ACTION, ANCHORS, Answer, Estimate, Projection
 
@@ -211,10 +212,16 @@ def document(one: Estimate) -> dict[str, Any]:
 
 def notes(policy: Described | None, estimates: Sequence[Estimate]) -> list[str]:
     """Return the assumptions behind the tables, one line each."""
-    table = nearest_table(estimates[0].tokens)
+    methods: dict[str, list[str]] = {}
+    for one in estimates[0].answers:
+        if one.own_acceptance_from:
+            methods.setdefault(one.own_acceptance_from.split(",")[0], []).append(one.method)
+    sources = []
+    for file, names in methods.items():
+        table = Path(file)
+        sources.append(f"{table.name} ({TABLES[table.stem]} tokens per chunk) for {', '.join(names)}")
     source = "this installation has no results/tables"
-    if any(one.own_acceptance_from for one in estimates[0].answers):
-        length = TABLES[table]
-        source = f"results/tables/{table}.csv, {length} tokens per chunk, on its own tasks; yours may be lower"
+    if sources:
+        source = f"results/tables/{'; '.join(sources)}. On your tasks it may be lower"
     assumed = [f"assumed: {'; '.join(policy.assumed)}"] if policy and policy.assumed else []
     return [*assumed, f"kerv's acceptance: {source}"]
