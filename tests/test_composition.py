@@ -114,6 +114,9 @@ def test_settings_survive_a_file(method):
         ("skip=always", "skip=always with prefill_draft=none: it executes a draft from before the prefill"),
         ("method=spec_vla proposer.depth=0", "proposer.depth=0"),
         ("skip=speed skip.v_min=2 skip.v_max=1", "skip.v_min=2 skip.v_max=1"),
+        ("method=spec_vla threshold.r=255", "threshold.r=255: bins from 0 to 254"),
+        ("method=kerv threshold.r_max=255", "threshold.r_max=255: bins from 0 to 254"),
+        ("method=kerv threshold=schedule threshold.r_max=255", "threshold.r_max=255: bins from 0 to 254"),
     ],
 )
 def test_what_does_not_belong_together_is_refused(overrides, says):

@@ -304,12 +304,10 @@ def test_the_reference_level_is_the_tasks_where_none_is_given(kind):
     ("kind", "values", "says"),
     [
         ("fixed", {"r": -1}, "threshold.r=-1"),
-        ("fixed", {"r": 255}, "threshold.r=255: bins from 0 to 254"),
         ("kinematic", {"k_s": 0.0}, "threshold.k_s=0.0"),
         ("kinematic", {"k_s": math.nan}, "threshold.k_s=nan"),
         ("kinematic", {"r_min": 16}, "threshold.r_min=16 threshold.r_max=15"),
         ("change", {"r_min": -1}, "threshold.r_min=-1"),
-        ("schedule", {"r_max": 255}, "threshold.r_max=255"),
         ("kinematic", {"phi": 0.0}, "threshold.phi=0"),
         ("schedule", {"tau": 0.0}, "threshold.tau=0"),
     ],

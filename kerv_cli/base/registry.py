@@ -267,10 +267,13 @@ class ThresholdPart(Part):
 
     Args:
         batchable: Whether the part works for several episodes at once.
+        radius: Name of the setting with the largest radius, such as `r_max`. A radius that is larger than the largest
+            distance between two tokens is refused. Empty: there is no such setting.
     """
 
     kind = "threshold"
     batchable: bool = False
+    radius: str = ""
 
 
 class RectifierPart(Part):

@@ -72,12 +72,7 @@ class Fixed(Threshold):
 
     @classmethod
     def build(cls, settings: Any, context: Any) -> Fixed:
-        """Build the threshold with the radius `settings.r`.
-
-        Raises:
-            UsageError: The radius is larger than the largest distance between two tokens.
-        """
-        context.check_radius("r", settings.r)
+        """Build the threshold with the radius `settings.r`."""
         return cls(settings.r)
 
     def radius(self) -> int:

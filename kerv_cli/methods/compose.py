@@ -88,6 +88,10 @@ class Method:
         chunk_steps(self.chunk, target.chunk)
         for kind, part in self.parts.items():
             part.check_code(kind, bool(target.actions.code))
+        threshold, most = self.settings["threshold"], target.actions.tokens - 1
+        name = registry.ThresholdPart.find(threshold.kind).radius
+        if name and getattr(threshold, name) > most:
+            raise UsageError(f"threshold.{name}={getattr(threshold, name)}: bins from 0 to {most}")
         proposer, draft, skip = self.proposer, self.prefill_draft, self.skip
         boundary = registry.BoundaryPart.find(self.settings["boundary"].kind)
         if proposer.has_boundary != boundary.chooses:

@@ -10,8 +10,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from kerv_cli.base.errors import UsageError
-
 
 @dataclass(frozen=True)
 class Context:
@@ -37,17 +35,3 @@ class Context:
     def calibration(self) -> Any:
         """The target's `Calibration`. It is typed as Any to avoid a circular import."""
         return self.artifact("calibration")
-
-    def check_radius(self, name: str, r: int) -> None:
-        """Refuse an acceptance radius that is larger than the largest distance between two tokens.
-
-        Args:
-            name: Name of the threshold's setting, for the error message.
-            r: The radius, in bins.
-
-        Raises:
-            UsageError: The radius is too large.
-        """
-        most = self.target.actions.tokens - 1
-        if r > most:
-            raise UsageError(f"threshold.{name}={r}: bins from 0 to {most}")

@@ -57,4 +57,4 @@ class FixedThresholdSettings:
     r: int = number(9, 0, MOST_BINS)  # largest accepted distance to the target's token, bins
 
 
-ThresholdPart("fixed", FixedThresholdSettings, batchable=True, any_code=True)(Fixed)
+ThresholdPart("fixed", FixedThresholdSettings, radius="r", batchable=True, any_code=True)(Fixed)

@@ -22,10 +22,9 @@ class GrowingSettings:
     most: int = number(9, 0, 254)
 
 
-@ThresholdPart("growing", GrowingSettings)
+@ThresholdPart("growing", GrowingSettings, radius="most")
 class Growing(Threshold):
     def __init__(self, settings: GrowingSettings, context: Context) -> None:
-        context.check_radius("most", settings.most)
         self.settings, self.decodes = settings, 0
 
     def reset(self) -> None:

@@ -272,10 +272,8 @@ class Variable(Threshold):
         """Read the settings. If they contain no K_S, read the task's K_S from the calibration.
 
         Raises:
-            UsageError: The largest radius is larger than the largest distance between two tokens.
             CheckpointError: The calibration has no K_S for the task.
         """
-        context.check_radius("r_max", settings.r_max)
         self.settings, self.measure = settings, settings.measure
         if settings.k_s is not None:
             self.k_s = settings.k_s
@@ -318,10 +316,10 @@ class Variable(Threshold):
 
 
 for _kind in ("kinematic", "change", "offset", "quoted"):
-    ThresholdPart(_kind, KinematicThresholdSettings, needs=KinematicThresholdSettings.needs)(Variable)
+    ThresholdPart(_kind, KinematicThresholdSettings, radius="r_max", needs=KinematicThresholdSettings.needs)(Variable)
 
 
-@ThresholdPart("schedule", ScheduleThresholdSettings)
+@ThresholdPart("schedule", ScheduleThresholdSettings, radius="r_max")
 class Schedule(Threshold):
     """The acceptance radius falls with the number t of decodes in the episode. The motion is not used.
 
@@ -330,12 +328,7 @@ class Schedule(Threshold):
     """
 
     def __init__(self, settings: ScheduleThresholdSettings, context: Context) -> None:
-        """Read the settings.
-
-        Raises:
-            UsageError: The largest radius is larger than the largest distance between two tokens.
-        """
-        context.check_radius("r_max", settings.r_max)
+        """Read the settings."""
         self.settings, self.decodes = settings, 0
 
     def reset(self) -> None:
@@ -362,7 +355,7 @@ class ContactThresholdSettings(RadiusRange):
     near: float = number(0.1, above=0, most=100)  # metres
 
 
-@ThresholdPart("contact", ContactThresholdSettings)
+@ThresholdPart("contact", ContactThresholdSettings, radius="r_max")
 class Contact(Threshold):
     """The acceptance radius r grows linearly from r_min at the object to r_max at the distance `near` and beyond.
 
@@ -374,10 +367,8 @@ class Contact(Threshold):
         """Read the settings.
 
         Raises:
-            UsageError: The policy estimates no positions. Or the largest radius is larger than the largest distance
-                between two tokens.
+            UsageError: The policy estimates no positions.
         """
-        context.check_radius("r_max", settings.r_max)
         if not hasattr(context.target, "hand_and_object"):
             raise UsageError("threshold=contact: this policy estimates no position of an object. Use another threshold")
         self.settings, self.target = settings, context.target
