@@ -272,7 +272,7 @@ def print_verdict(report: Report) -> None:
     typer.echo(f"verdict: {report.verdict.sentence}")
     if command := report.command_to_settle:
         typer.echo(f"settle it: {command}")
-    typer.echo(f"page: {study.root / 'report.html'}")
+    typer.echo(f"page: {report.files[-1]}")
     typer.echo(f"browse: kerv board{results_word(study.database.words)}")
     recordings = study.recordings
     mend = "" if study.kind == "import" else "; the same sweep with record=1 rerun=all does that"

@@ -205,7 +205,7 @@ def write_study(data: StudyData, loss: float, profiles: Sequence[NamedProfile] =
         report.files.append(folder / "plots" / f"{name}{suffix}.png")
         write_bytes(report.files[-1], png(figure, data.study.title or data.study.name, about(data.results)))
     page = render(report)
-    report.files.append(data.study.root / "report.html")
+    report.files.append(data.study.root / f"report{data.against}.html")
     write_text(report.files[-1], page)
     return report
 
