@@ -45,8 +45,11 @@ class UsageError(KervError):
         self.key = key
 
 
+_LISTED = 24  # names that a message lists
+
+
 class UnknownName(UsageError):
-    """A name does not exist. The message suggests similar names, or lists all.
+    """A name does not exist. The message suggests similar names, or lists the known ones.
 
     Args:
         kind: Kind of thing that is named, such as `task`, for the message.
@@ -56,7 +59,8 @@ class UnknownName(UsageError):
 
     def __init__(self, kind: str, name: str, names: Iterable[str]) -> None:
         names = list(names)
-        hint = did_you_mean(name, names) or (f"known: {', '.join(names)}" if names else "there is none")
+        more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+        hint = did_you_mean(name, names) or (f"known: {', '.join(names[:_LISTED])}{more}" if names else "there is none")
         super().__init__(f"unknown {kind} '{name}': {hint}", kind)
 
 

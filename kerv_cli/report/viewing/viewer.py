@@ -34,8 +34,11 @@ _START_SECONDS = 2.0
 
 
 def recordings_below(folder: Path) -> Iterator[Path]:
-    """Return the .rrd files in a folder and its subfolders, except hidden files."""
-    return filter(Path.is_file, folder.rglob("[!.]*.rrd"))
+    """Yield the .rrd files in a folder and its subfolders, except hidden files. Unreadable folders are left out."""
+    for place, _, names in os.walk(folder):
+        for name in names:
+            if name.endswith(".rrd") and not name.startswith(".") and (path := Path(place, name)).is_file():
+                yield path
 
 
 def find_recordings(paths: Iterable[Path]) -> list[Path]:
