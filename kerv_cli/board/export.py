@@ -11,7 +11,7 @@ import asyncio
 import html
 import os
 import re
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -30,13 +30,20 @@ MOST_FILM_BYTES = 8_000_000
 """Films are left out after this many bytes."""
 
 
-def export_board(database: Database, names: Collection[str], folder: Path) -> list[Path]:
+def export_board(
+    database: Database,
+    names: Collection[str],
+    folder: Path,
+    advance: Callable[[int, int, str], None] = lambda done, total, text: None,
+) -> list[Path]:
     """Write the pages of a board into a folder, and return the files, `index.html` first.
 
     Args:
         database: The database.
         names: Ids of the runs to export. Empty: all runs.
         folder: An empty folder.
+        advance: Called before each page, with the number of finished pages, the number of all pages that are known so
+            far, and the page's address.
 
     Raises:
         KervError: A page cannot be shown.
@@ -44,7 +51,7 @@ def export_board(database: Database, names: Collection[str], folder: Path) -> li
     """
     app = make_app(database)
     app.state.only, app.state.live = frozenset(names), False
-    pages = _collected(app)
+    pages = _collected(app, advance)
     written = []
     for address, content in pages.items():
         path = folder / file_of(address)
@@ -87,7 +94,7 @@ def _asked(app: Starlette, address: str) -> tuple[int, str, bytes]:
     return start["status"], Headers(raw=start["headers"])["content-type"], content
 
 
-def _collected(app: Starlette) -> dict[str, str | bytes]:
+def _collected(app: Starlette, advance: Callable[[int, int, str], None]) -> dict[str, str | bytes]:
     """Ask for the first page and for all pages and files that it leads to. Return the answers by address.
 
     Failed answers are left out. Parts that a browser loads later (`hx-trigger="load"`) are put into their page.
@@ -100,6 +107,7 @@ def _collected(app: Starlette) -> dict[str, str | bytes]:
     seen = set(waiting)
     while waiting:
         address = waiting.pop(0)
+        advance(len(seen) - len(waiting) - 1, len(seen), address)
         is_film = file_of(address).endswith(".gif")
         if is_film and films >= MOST_FILM_BYTES:
             continue

@@ -12,7 +12,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import number, setting
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, database_of, end_at_once, end_with_json
+from kerv_cli.cli.common import AsJson, database_of, end_at_once, end_with_json, progress_bar
 
 BOARD_FILE = "static/board.css"
 """File of every exported board. A folder that has it is replaced."""
@@ -66,7 +66,8 @@ def export(settings: CommandSettings, names: list[str], as_json: AsJson = False)
     if folder.exists() and not (folder / BOARD_FILE).is_file() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder} holds other files: name another folder")
     runs = [find_run(database, name).id for name in names[1:]]
-    write_folder(folder, lambda new: files.extend(export_board(database, runs, new)))
+    with progress_bar("pages", has_estimate=True) as advance:  # no estimate: pages lead to further pages
+        write_folder(folder, lambda new: files.extend(export_board(database, runs, new, advance)))
     size = disk_bytes(folder)
     if as_json:
         end_with_json({"folder": folder, "files": len(files), "bytes": size})

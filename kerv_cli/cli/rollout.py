@@ -42,12 +42,16 @@ def rollout(
         return
     planned = planned_study(resolved, ["rollout", *(["-m"] if multirun else []), *overrides], is_rollout=True)
     if plan:
+        from kerv_cli.lab.study import TimeLeft
+
         names = ", ".join(f"{label}{stress_text(asdict(settings))}" for label, settings in resolved.settings.items())
-        total, tasks = len(planned.episodes), resolved.tasks
-        seconds = SECONDS_PER_EPISODE * total
+        total, tasks, left = len(planned.episodes), resolved.tasks, TimeLeft(planned, SECONDS_PER_EPISODE)
         if as_json:
-            end_with_json({"settings": list(resolved.settings), "tasks": tasks, "episodes": total, "seconds": seconds})
-        typer.echo(f"{names}: {count(len(tasks), 'task')}, {count(total, 'episode')}, {about(seconds)}")
+            end_with_json({"settings": list(resolved.settings), "tasks": tasks, "episodes": total,
+                           "seconds": left.seconds, "source": left.source})  # fmt: skip
+        typer.echo(
+            f"{names}: {count(len(tasks), 'task')}, {count(total, 'episode')}, {about(left.seconds, left.source)}"
+        )
         return
     from kerv_cli.report.measures import averaged, frame_of
     from kerv_cli.report.summary import SummaryTable, setting_tables

@@ -339,7 +339,9 @@ class TimeLeft:
                 self._stored[key] = float(mean)
         self._ended: Counter[str] = Counter()
         self._measured: defaultdict[str, float] = defaultdict(float)  # seconds of those that ended, by setting
-        self.source = f"measured on {stored} stored episodes" if stored else f"a guess of {guess:g} s per episode"
+        self.source = (
+            f"measured on {count(stored, 'stored episode')}" if stored else f"a guess of {guess:g} s per episode"
+        )
 
     def see(self, event: Event) -> None:
         """Update the estimate with an event of the run: an episode that ended, or episodes that will not run."""

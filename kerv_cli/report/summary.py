@@ -20,6 +20,7 @@ from rich.text import Text
 from kerv_cli.base.durations import count
 from kerv_cli.engine.record import PHASES
 from kerv_cli.episodes.identity import Setting, stress_text
+from kerv_cli.lab.plan import seeds_text
 from kerv_cli.report.measures import MACRO, MICRO, Result, averaged, frame_of, is_number
 from kerv_cli.report.profiles import ENCODERS
 from kerv_cli.report.reprice import Priced
@@ -268,9 +269,10 @@ def setting_tables(data: StudyData) -> Iterator[tuple[Any, Any, str]]:
         cells = cells_of(row) | {"task": task, "success": success, "drafts accepted": accepted}
         if task != "all" or row.tasks > 1:
             rows.append(list(map(cells.__getitem__, _TASK_COLUMNS)))
-    seeds = f"{episodes['seed'].min()}…{episodes['seed'].max()}"
+    seeds = seeds_text(episodes["seed"])
+    seeds = f"seeds {seeds}" if episodes["seed"].nunique() > 1 else f"seed {seeds}"
     observation = setting.identity.get("observation", "")
-    title = f"{setting.label}, observation {observation}{stress_text(setting.settings)}, seeds {seeds}"
+    title = f"{setting.label}, observation {observation}{stress_text(setting.settings)}, {seeds}"
     timed = episodes["seconds"].notna().all()
     if not timed:
         title += f"; not timed: {setting.batch} episodes at a time"
