@@ -1,4 +1,4 @@
-"""Acceptance rules: which draft tokens are good enough (docs/methods.md §2.1). This file imports nothing heavy.
+"""Acceptance rules: which draft tokens are good enough (docs/methods.md §2.1). This file imports no torch and no numpy.
 
 A draft is a tree of tokens. A path leads from the last committed token down this tree. The longest accepted path wins.
 Ties go to the path with the smaller summed distance to the target tokens, then to the path that was proposed first.
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 
 class Accepted(NamedTuple):
-    """The draft nodes that an acceptance rule accepts, and the one it rejects.
+    """The draft nodes that an acceptance rule accepts, and the node that it rejects.
 
     Attributes:
         path: Indices of the accepted nodes, from depth 0 down. Empty if none was accepted.
-        rejected: Index of the rejected node after the path. If several nodes follow the path, the one whose token is
-            nearest to the target's. None if the path ends at a leaf.
+        rejected: Index of the rejected node after the path. If several nodes follow the path, this is the node whose
+            token is nearest to the target's token. None if no node was rejected, because the path ends at a leaf.
     """
 
     path: tuple[int, ...]
@@ -41,12 +41,13 @@ def accept_by_group(
     group_limit: int,
     bounds: Sequence[tuple[int, int]],
 ) -> Accepted:
-    """Return the longest path of whole kinematic groups, such as position or rotation (HeiSD's `sequence` rule).
+    """Return the longest accepted path, if tokens are accepted by kinematic group (HeiSD's `sequence` rule).
 
-    The tokens of one group in one control step are accepted together or not at all. A group is accepted if each token's
-    distance is within the limit of the token's DoF, and if the distances sum to at most `group_limit`. The distance of
-    a token is the absolute difference, in bins, from the target's prediction at this position. A path ends before a
-    group that is rejected or that is only partly in the tree.
+    A group is, for instance, position or rotation. The tokens of one group in one control step are accepted together or
+    not at all. A group is accepted if each token's distance is within the limit of the token's DoF, and if the
+    distances sum to at most `group_limit`. The distance of a token is the absolute difference, in bins, from the
+    target's prediction at this position. A path ends before a group that is rejected or that is only partly in the
+    tree.
 
     If `start` is inside a group, the group's first tokens are committed already. Their distance counts as 0. Only the
     group's other tokens are judged.
@@ -117,7 +118,10 @@ class DistanceRule(Buildable):
 
     @abstractmethod
     def limits(self, r: int) -> tuple[int, ...]:
-        """Return the largest accepted distance of each DoF, (D,) in bins, for the acceptance radius `r` in bins."""
+        """Return the largest accepted distance of each DoF, (D,) in bins, for the acceptance radius `r` in bins.
+
+        For a code of chunks, return a single distance.
+        """
 
     def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
         """Return the longest accepted path, and the node that was rejected after it.

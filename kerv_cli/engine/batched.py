@@ -29,7 +29,7 @@ class BatchDecoder:
     """
 
     def __init__(self, decoder: Decoder) -> None:
-        """Take target and method from a decoder. `Method.check` tests whether the method can be batched."""
+        """Use the target and the method of `decoder`. `Method.check` tests whether the method can be batched."""
         self.decoder, self.target = decoder, decoder.target
         self.limits = decoder.acceptance.limits(decoder.threshold.radius())
         self.skip, self.size = decoder.parts.skip, decoder.target.actions.longest(decoder.steps)
@@ -79,8 +79,8 @@ class BatchDecoder:
     def _cache(self, rows: int) -> Cache:
         """Return an empty cache for `rows` sequences.
 
-        The last cache is used again if it has this number of sequences. Otherwise a new one replaces it. The number
-        changes each time an episode ends, and keeping a cache for each number would fill the memory.
+        The last cache is used again if it has this number of sequences. Otherwise a new cache replaces it. The number
+        of sequences often changes, and keeping a cache for each number would fill the memory.
         """
         if rows not in self._caches:
             self._caches = {rows: self.target.new_cache(rows, self.target.max_prompt + self.size)}
@@ -95,8 +95,8 @@ def greedy(target: Target, prompt: Tensor, cache: Cache | None = None, size: int
     Args:
         target: The policy.
         prompt: The prompts' embeddings (B, P, E).
-        cache: An empty cache with room for P + N tokens. None: make a new cache.
-        size: N, number of tokens to decode. 0: the most that a chunk of the target can have.
+        cache: An empty cache with room for P + N tokens. If None, a new cache is made.
+        size: N, number of tokens to decode. If 0, the largest number that a chunk of the target can have.
 
     Returns:
         Two tensors. The decoded tokens (B, N), which after an end token are all end tokens. The hidden states

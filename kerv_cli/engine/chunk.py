@@ -30,11 +30,11 @@ def chunk_steps(chunk: int, trained: int) -> int:
     """Return the number of control steps to decode at once.
 
     Args:
-        chunk: Number of control steps that the user chose. 0: use `trained`.
+        chunk: Number of control steps that the user chose. If 0, `trained` is returned.
         trained: Number of control steps that the target was trained for.
 
     Raises:
-        UsageError: `chunk` is larger than `trained`.
+        UsageError: `chunk` is negative, or larger than `trained`.
     """
     if not 0 <= chunk <= trained:
         raise UsageError(f"chunk={chunk}: the target was trained for {trained} control steps")
@@ -122,7 +122,7 @@ class Rejection:
     Attributes:
         draft: The n draft tokens after the rejected one.
         target: n + 1 tokens: the target's prediction after the rejected token, then after each token of `draft`. The
-            target predicts as if these tokens had been committed.
+            target predicts as if the rejected token and `draft` had been committed.
     """
 
     draft: tuple[int, ...] = ()
@@ -136,7 +136,7 @@ class TargetSide:
     The cache holds the prompt and the committed tokens, except those that the target has not read yet (`uncached`).
 
     Attributes:
-        encode: Function that encodes the observation.
+        encode: Function that encodes the observation and returns the prompt's embeddings (1, P, E).
         cache: Keys and values of the prompt and of committed tokens.
         hidden: Hidden states after the prefill, (1, P + c − 1, E). c is the number of tokens that the prefill
             committed. None before the prefill.
@@ -150,19 +150,19 @@ class TargetSide:
     def prompt(self) -> Tensor:
         """The prompt's embeddings (1, P, E).
 
-        They are computed when first read. So skipped chunks need not pay for encoding.
+        They are computed when this property is first read. So skipped chunks need not pay for encoding.
         """
         return self.encode()
 
     @property
     def prompt_length(self) -> int:
-        """Number of prompt tokens P. Reading it encodes the prompt."""
+        """Number of prompt tokens P. Reading this property encodes the prompt, if that has not been done yet."""
         return self.prompt.shape[1]
 
     def uncached(self, tokens: Sequence[int]) -> list[int]:
         """Return the committed `tokens` that the target has not read yet. Empty before the prefill.
 
-        Usually this is only the newest token. After a rectifier has filled a control step, it may be several.
+        Usually this is only the newest token. After a rectifier has filled a control step, there may be several.
         """
         return list(tokens[self.cache.length - self.prompt_length :]) if tokens else []
 
@@ -220,15 +220,15 @@ class Chunk:
     def variability(self) -> float | None:
         """Kinematic variability K: the mean difference of draft and target tokens, in normalised action units.
 
-        None if no draft token was compared (docs/methods.md §3.2).
+        None if no draft token was compared, or if tokens have no distance (docs/methods.md §3.2).
         """
         return variability(self.rounds, self.space)
 
     def distance(self, tokens: Sequence[int], others: Sequence[int]) -> float:
         """Return the mean absolute difference of two token sequences, in normalised action units.
 
-        Both begin at the chunk's first token and have the same length. The result is infinite if they differ in a
-        strict DoF (one that must equal the target's token, such as a gripper).
+        Both sequences begin at the chunk's first token and have the same length. The distance is infinite if they
+        differ in a strict DoF (a DoF that must equal the target's token, such as a gripper).
         """
         first, second = np.array(tokens), np.array(others)
         if (first != second)[self.space.strict_tokens(len(first))].any():
@@ -301,8 +301,8 @@ class Chunk:
     def rectify(self, found: Rectified, with_target_token: bool) -> None:
         """Commit the values that a rectifier predicted.
 
-        The robot executes these values without rounding. If decoding continues, the target reads the
-        nearest tokens instead.
+        The robot executes these values without rounding. If decoding continues, the target reads the tokens that are
+        nearest to these values.
 
         Args:
             found: What the rectifier predicted.

@@ -21,25 +21,26 @@ from kerv_cli.base.registry import DRAFTING, ProposerPart
 from kerv_cli.engine.record import PARALLEL, DecodeRecord
 
 FORWARDS = ("encode", "prefill", "verify", "feed", DRAFTING, "tree")
-"""Kinds of cost that depend on the target's size (docs/measuring.md). Each other kind is a proposer's draft."""
+"""Kinds of cost that depend on the target's size (docs/measuring.md). Every other kind, such as `retrieval`, is
+the cost of other proposers' drafts."""
 
 FORMAT = 2
 """Version of the profile's file format."""
 
 READ_PHASES = ("vision", "propose", "accept", "rectify", "other")
-"""Phases whose recorded seconds the cost model reads. For `vision` it only reads whether they are zero."""
+"""Phases whose recorded seconds the cost model reads. For `vision`, it only reads whether the seconds are 0."""
 
 
 Columns = Mapping[str, np.ndarray]
-"""An array per name."""
+"""Arrays by name."""
 COUNTED = ("mode", "proposer", "start", "tree_size", "accepted", "levels")
 """Attributes of `Round` that the cost model reads."""
 
 
 def source_costs() -> dict[str, list[str]]:
-    """Map each kind of cost to the names of the proposers whose drafting time this cost gives.
+    """Return, for each kind of cost, the names of the proposers whose drafts have this cost.
 
-    For all other proposers, the cost model keeps the recorded drafting time.
+    Proposers without a kind of cost are left out. For them, the cost model keeps the recorded drafting time.
     """
     costs: dict[str, list[str]] = {}
     for name, part in ProposerPart.every().items():
@@ -128,12 +129,12 @@ def read_profile(path: Path) -> Profile:
 
 
 class Calls(NamedTuple):
-    """All forwards, or all drafts, of one kind in several decodes. There are m of them.
+    """All m forwards, or all m drafts, that have one kind of cost in several decodes.
 
     Attributes:
-        decode: (m,) index of the decode that made each call.
-        rows: (m,) number of tokens that each call processed, not counting the prompt's tokens.
-        with_prompt: (m,) bool, whether the call also processed the prompt's tokens.
+        decode: (m,) index of the decode that ran each forward or draft.
+        rows: (m,) number of tokens that each forward or draft processed, not counting the prompt's tokens.
+        with_prompt: (m,) bool, whether the forward or draft also processed the prompt's tokens.
     """
 
     decode: np.ndarray
@@ -147,8 +148,8 @@ class Work:
 
     Attributes:
         calls: The forwards and the drafter's drafts, by kind of cost (one of `FORWARDS`).
-        sources: Drafts of other proposers, by kind of cost, such as `retrieval`. For each kind, (decodes,) bool:
-            whether the decode used a proposer of this kind.
+        sources: For each kind of cost that other proposers' drafts have, such as `retrieval`: (decodes,) bool, whether
+            the decode used a proposer with this kind of cost.
         host: (decodes,) recorded seconds that neither depend on the target's size nor were spent on drafting.
         propose: (decodes,) recorded seconds of drafting. 0 if the drafter drafted, because `calls` holds its drafts.
     """
@@ -168,8 +169,8 @@ def work_of(rounds: Columns, counts: np.ndarray, phases: Columns, looked_up: np.
     """Return what several decodes computed, from the columns of their records.
 
     Args:
-        rounds: For each name in `COUNTED`, that attribute of all n rounds, (n,). The rounds of all decodes follow each
-            other in order.
+        rounds: For each name in `COUNTED`, an array (n,) with this attribute of all n rounds. The rounds of the first
+            decode come first, then those of the second decode, and so on.
         counts: Number of rounds of each decode, (decodes,).
         phases: For each name in `READ_PHASES`, the recorded seconds of that phase, (decodes,).
         looked_up: Whether the decode searched the datastore, (decodes,) bool.

@@ -1,4 +1,4 @@
-"""What the parts of a method return to the decoder. This file imports nothing heavy."""
+"""What the parts of a method return to the decoder. This file imports neither torch nor numpy."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Rectified(NamedTuple):
 
     Attributes:
         values: Normalised actions (steps, D): first the values of the committed tokens, then predicted values.
-        ends: Whether the chunk ends with these actions, so that later control steps are dropped. Else the target
+        ends: Whether the chunk ends with these actions, so that later control steps are dropped. If False, the target
             decodes the later steps.
     """
 
@@ -37,9 +37,9 @@ class SkipDecision(NamedTuple):
     """What a skip rule decides about a chunk.
 
     Attributes:
-        tokens: The N tokens of the chunk, which are executed without verification. None: the target decodes the chunk.
-        proposer: Name of the proposer that drafted `tokens`. PARALLEL (`record.py`): a parallel target computed them.
-        reason: The rule's reason to skip or to verify, which `DecodeRecord.reason` stores. None: no reason is given.
+        tokens: The N tokens of the chunk, to execute without verification. None if the target decodes the chunk.
+        proposer: Name of the proposer that drafted `tokens`. PARALLEL (`record.py`) if a parallel target computed them.
+        reason: The rule's reason to skip or to verify, which `DecodeRecord.reason` stores. None if there is no reason.
     """
 
     tokens: Sequence[int] | None = None

@@ -41,7 +41,7 @@ class Parts:
     skip: Skip | None = None  # may execute a draft without verification
 
     def similarity(self, chunk: Chunk) -> float | None:
-        """Return the cosine of the best match in the datastore. None if no part searched it for this chunk."""
+        """Return the cosine of the best match in the datastore. None if no part searched for this chunk."""
         parts = filter(None, (self.skip, self.prefill_draft, self.proposer))
         found = [part.similarity(chunk) for part in parts]
         return next((one for one in found if one is not None), None)
@@ -52,11 +52,11 @@ class Verified(NamedTuple):
 
     Attributes:
         hidden: The target's hidden states (1, before + n, E). The first `before` belong to tokens that were not in the
-            cache yet: the prompt, or the last committed token. The other n belong to the draft's nodes.
+            cache yet: the prompt, or the newest committed tokens. The other n belong to the draft's nodes.
         tree: The draft's n nodes, on the CPU.
         target_tokens: 1 + n tokens, on the CPU: the target's prediction after the last committed token, then its
             prediction after each node.
-        levels: Depth down to which a tree was drafted. 0 for a chain.
+        levels: Number of levels of the drafted tree. 0 for a chain.
     """
 
     hidden: Tensor
@@ -81,11 +81,11 @@ class Decoder(ActionDecoder):
 
         Args:
             target: The policy that decodes and verifies.
-            parts: The method's parts. None: decode autoregressively.
-            chunk: H, number of control steps to decode at once. 0: the number that the target was trained for.
+            parts: The method's parts. If None, the target decodes autoregressively.
+            chunk: H, number of control steps to decode at once. If 0, the number that the target was trained for.
 
         Raises:
-            UsageError: `chunk` is longer than the target was trained for.
+            UsageError: `chunk` is negative, or larger than the number that the target was trained for.
         """
         super().__init__(target.actions, target.cameras)
         self.target, self.parts = target, parts or Parts()
@@ -102,7 +102,7 @@ class Decoder(ActionDecoder):
 
     @cached_property
     def autoregressive(self) -> Decoder:
-        """An autoregressive decoder of the same target. `decode` compares its actions with this decoder's."""
+        """An autoregressive decoder of the same target. Its actions are compared with the method's."""
         return Decoder(self.target, chunk=self.steps)
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
@@ -170,11 +170,12 @@ class Decoder(ActionDecoder):
 
         Args:
             prompt: The prompt's embeddings (1, P, E), or a function that computes them when they are first needed.
-            stopwatch: Measures the phases. None: make a new stopwatch.
-            observation: Needed only by drafters that read images or states themselves.
+            stopwatch: Measures the phases. If None, a new stopwatch is made.
+            observation: The observation. Needed only by drafters that read images or states themselves.
 
         Returns:
-            The finished chunk: N committed tokens, or fewer if a rectifier ended it with predicted actions.
+            The finished chunk. It has N committed tokens, or fewer if an end token or a rectifier's prediction ended
+            the chunk early.
         """
         stopwatch = stopwatch or Stopwatch(self.target.device)
         chunk, skip = self._new_chunk(prompt, observation), self.parts.skip
@@ -226,7 +227,7 @@ class Decoder(ActionDecoder):
     def decode_plainly(self, chunk: Chunk, stopwatch: Stopwatch) -> None:
         """Decode the remaining tokens without drafts.
 
-        This takes one call if the target supports that, else one forward per token.
+        The target decodes them in one call if it can (`ContinuesGreedily`), else with one forward per token.
         """
         tokens = None
         if isinstance(self.target, ContinuesGreedily):
@@ -258,7 +259,7 @@ class Decoder(ActionDecoder):
         return torch.cat(tokens[1:]).tolist()
 
     def propose(self, chunk: Chunk, proposer: Proposer | None, stopwatch: Stopwatch) -> Draft:
-        """Return the proposer's draft. It is empty if there is no proposer or only one token is left to decode.
+        """Return the proposer's draft. The draft is empty if there is no proposer or only one token is left to decode.
 
         A draft is at most `remaining − 1` tokens deep, because the target itself gives the chunk's last token.
 
@@ -276,8 +277,8 @@ class Decoder(ActionDecoder):
     def verify(self, chunk: Chunk, draft: Draft) -> Verified:
         """Run the target once, over the tokens that are not in its cache yet, followed by the draft.
 
-        In the first round, the uncached tokens are the prompt. In later rounds, this is the last committed token, or
-        the tokens that a rectifier has filled.
+        In the first round, the uncached tokens are the prompt. In later rounds, the only one is the last committed
+        token, unless a rectifier has filled several tokens.
         """
         target, cache, uncached = self.target, chunk.target.cache, chunk.target.uncached(chunk.tokens)
         before = len(uncached) or chunk.target.prompt_length
@@ -297,7 +298,7 @@ class Decoder(ActionDecoder):
         return Verified(hidden, tree, targets.astype(np.int64).tolist(), draft.levels or tree.levels)
 
     def accept(self, chunk: Chunk, verified: Verified, proposer: Proposer | None) -> Accepted:
-        """Return the path that the acceptance rule chooses. It is empty if there was no proposer."""
+        """Return the path that the acceptance rule chooses. The path is empty if there was no proposer."""
         if proposer is None:
             return Accepted((), None)
         rule, r = self.acceptance.of_drafts_from(proposer.name), self.threshold.radius()
@@ -359,7 +360,7 @@ class Decoder(ActionDecoder):
         return torch.cat([hidden[:, :before], hidden[:, before + kept]], 1)
 
     def rectify(self, chunk: Chunk, hidden: Tensor, stopwatch: Stopwatch) -> Tensor:
-        """After a rejection, let the rectifier predict the missing values of the control step.
+        """After a rejection, let the rectifier predict the missing values of the rejected token's control step.
 
         If the rectifier filled several values and the chunk is not complete, the target reads their tokens in one more
         forward, which also gives the next token.

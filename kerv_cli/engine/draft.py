@@ -27,9 +27,9 @@ class Draft:
 
     Attributes:
         tokens: (n,) int64.
-        parents: Index of each token's parent, (n,) int64; −1 is the last committed token. None: the draft is a chain.
+        parents: Index of each token's parent, (n,) int64; −1 is the last committed token. None for a chain.
         levels: Maximum depth of the tree. Needed only when `parents` is on the GPU.
-        paths: The mask `ancestors`, if the proposer has computed it already. None: `ancestors` computes the mask.
+        paths: The mask `ancestors`, if the proposer has computed it already. If None, `ancestors` computes the mask.
     """
 
     tokens: Tensor
@@ -43,7 +43,7 @@ class Draft:
 
         Args:
             tokens: The n tokens.
-            parents: Index of each token's parent, −1 for the last committed token. None: the draft is a chain.
+            parents: Index of each token's parent, −1 for the last committed token. None for a chain.
         """
         return cls(_vector(tokens), None if parents is None else _vector(parents))
 
@@ -64,6 +64,7 @@ class Draft:
         Raises:
             KervError: A token is out of range, a path is too long, a tree on the GPU has no `levels`, or tokens and
                 parents are on different devices.
+            ValueError: A parent on the CPU does not come before its child.
         """
         device, reached = self.tokens.device, len(self)
         if device == HOST:
@@ -93,15 +94,15 @@ class Draft:
         return [x for x in (self.tokens, self.parents) if x is not None and x.device != HOST]
 
     def judged(self, remote: Sequence[np.ndarray]) -> TokenTree:
-        """Return the draft as a tree on the CPU, which an acceptance rule can judge.
+        """Return the draft as a tree on the CPU, for an acceptance rule.
 
         Args:
-            remote: Copies of the tensors in `Draft.remote` on the CPU.
+            remote: Copies, on the CPU, of the tensors in `Draft.remote`. Empty for a draft on the CPU.
         """
         return TokenTree.build(*(vector.astype(np.int64).tolist() for vector in remote)) if remote else self.tree
 
     def tokens_after(self, committed: list[int], device: torch.device) -> Tensor:
-        """Return k committed tokens and then the draft's n tokens: (k + n,) int64 on `device`."""
+        """Return the k tokens in `committed`, followed by the draft's n tokens: (k + n,) int64 on `device`."""
         if self.tokens.device == HOST:
             return upload(np.concatenate([np.array(committed, dtype=np.int64), self.tokens.numpy()]), device)
         return torch.cat([upload(committed, device), self.tokens]) if committed else self.tokens
@@ -126,7 +127,8 @@ class Draft:
 
         Args:
             start: Position of the first of these tokens.
-            before: Number of tokens that are forwarded before the draft: the prompt, or the last committed token.
+            before: Number of tokens that are forwarded before the draft: the prompt's, or the committed tokens that are
+                not in the cache yet.
             device: Where the tensor goes.
         """
         stop, seen = start + before, self.ancestors

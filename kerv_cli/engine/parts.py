@@ -1,6 +1,6 @@
 """Interfaces of the parts of a method that the decode loop calls: threshold, rectifier, boundary and skip rule.
 
-Proposers are in `proposer.py`, acceptance rules in `acceptance.py`. This file imports nothing heavy.
+Proposers are in `proposer.py`, acceptance rules in `acceptance.py`. This file imports neither torch nor numpy.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Buildable(ABC):  # noqa: B024 - its subclasses are the interfaces
         return cls(settings, context)
 
     def similarity(self, chunk: Chunk) -> float | None:
-        """Return the cosine of the best match in the datastore. None if this part did not search one for this chunk."""
+        """Return the cosine of the best match in the datastore. None if this part did not search for this chunk."""
         return None
 
 
@@ -84,8 +84,8 @@ class Rectifier(Buildable):
     """Completes a chunk with a prediction after a draft token was rejected (docs/methods.md §3.1).
 
     Attributes:
-        uses_target_token: Whether the target's own token at the rejected position is executed. Else the rectifier
-            predicts it, too.
+        uses_target_token: Whether the target's own token at the rejected position is executed. If False, the rectifier
+            also predicts the value at this position.
     """
 
     uses_target_token = True
@@ -101,7 +101,7 @@ class Rectifier(Buildable):
 
     @abstractmethod
     def rectify(self, chunk: Chunk) -> Rectified | None:
-        """Predict the missing values of the rejected control step.
+        """Predict the missing values of the control step in which a draft token was rejected.
 
         Returns:
             The predicted values. None if the rectifier predicts nothing. The target then goes on decoding after its own
@@ -125,7 +125,7 @@ class Boundary(Buildable):
 
 
 class Skip(Buildable):
-    """Decides before the target runs whether a draft is executed without verification (docs/methods.md §4.3)."""
+    """Decides, before the target runs, whether a chunk is executed without verification (docs/methods.md §4.3)."""
 
     phase = "propose"  # entry of `PHASES` that the time of `take` counts for
 

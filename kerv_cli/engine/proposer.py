@@ -1,4 +1,4 @@
-"""Base classes of proposers (docs/extending.md). This file imports nothing heavy."""
+"""Base classes of proposers (docs/extending.md). This file imports neither torch nor numpy."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ class Proposer(Buildable):
 
     Attributes:
         name: Name in the records, e.g. `drafter`.
-        nodes: Maximum number of tokens in a draft, for which the cache reserves room. 0: N, all tokens of a chunk.
+        nodes: Maximum number of tokens in a draft, for which the cache reserves room. 0 if a draft never has more than
+            N tokens, the number of tokens in a chunk.
     """
 
     name = ""
@@ -34,7 +35,7 @@ class Proposer(Buildable):
 
     @abstractmethod
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """Return a draft with at most `depth` tokens on any path. It may be empty."""
+        """Return a draft with at most `depth` tokens on any path. The draft may be empty."""
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
         """Learn from a round that has ended.
@@ -57,7 +58,7 @@ class ChainProposer(Proposer):
     """
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """Return the best chain as a draft; an empty draft if there is no chain."""
+        """Return the best chain as a draft. The draft is empty if there is no chain."""
         from kerv_cli.engine.draft import EMPTY, Draft
 
         chains = self.chains(chunk, depth)

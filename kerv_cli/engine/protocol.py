@@ -15,8 +15,9 @@ from torch import Tensor, nn
 from kerv_cli.base.spaces import ActionSpace, Observation
 
 Seen = np.ndarray | Tensor | None
-"""Attention mask (T, M) bool: which of the last M tokens, old or new, each of T new tokens attends to. None: attention
-is causal. A target on a GPU may get a tensor instead of an array."""
+"""Attention mask (T, M) bool, or None if attention is causal. Entry [i, j] says whether new token i attends to token j
+of the last M tokens. These are M − T cached tokens and then the T new tokens. A target on a GPU may get a tensor
+instead of an array."""
 
 
 class Cache(Protocol):
@@ -32,7 +33,7 @@ class Cache(Protocol):
     def compact(self, start: int, slots: Tensor) -> None:
         """Keep the accepted draft tokens and remove the rejected ones.
 
-        The contents of `slots` move to the slots start, start + 1, …, and `length` becomes start + n.
+        The contents of the n `slots` move to the slots start … start + n − 1, and `length` becomes start + n.
 
         Args:
             start: First slot after the prompt and the committed tokens, which stay where they are.
@@ -86,9 +87,10 @@ class Target(Protocol):
         Args:
             x: Embeddings of the new tokens (B, T, E).
             positions: Position of each new token in the sequence (T,), for the positional encoding.
-            cache: From `new_cache`. The new tokens attend to all cached tokens and are added to the cache. None: there
-                are no earlier tokens.
-            seen: Attention mask (T, T) bool: whether new token i attends to new token j. None: attention is causal.
+            cache: From `new_cache`. The new tokens attend to all cached tokens and are added to the cache. None if
+                there are no earlier tokens.
+            seen: Attention mask (T, T) bool: entry [i, j] says whether new token i attends to new token j. None if
+                attention is causal.
         """
 
     def head(self, hidden: Tensor) -> Tensor:
@@ -114,7 +116,7 @@ class ContinuesGreedily(Protocol):
             token: The last committed token. It is not in the cache yet.
             count: Number of tokens to decode.
             cache: Holds all tokens before `token`.
-            end: Token after which to stop. None: decode all `count` tokens.
+            end: Token after which to stop. If None, all `count` tokens are decoded.
 
         Returns:
             The decoded tokens. None if the target, as it was loaded, cannot decode them in one call.
@@ -132,7 +134,8 @@ class PredictsTokens(Protocol):
             tokens: The new tokens (T,) int64.
             positions: Position of each new token in the sequence (T,), for the positional encoding.
             cache: From `new_cache`. The new tokens attend to all cached tokens and are added to the cache.
-            seen: Attention mask (T, T) bool: whether new token i attends to new token j. None: attention is causal.
+            seen: Attention mask (T, T) bool: entry [i, j] says whether new token i attends to new token j. None if
+                attention is causal.
 
         Returns:
             The most probable token after each new token, (T,) int64, and the hidden states (1, T, E) of the new tokens.
@@ -207,5 +210,5 @@ class ParallelTarget(Target, Protocol):
 
         Args:
             prompt: Embeddings of the prompts (B, P, E).
-            cache: An empty cache with room for P + N tokens. None: compute without a cache.
+            cache: An empty cache with room for P + N tokens. If None, no cache is used.
         """

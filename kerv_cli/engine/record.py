@@ -14,7 +14,7 @@ import numpy as np
 from kerv_cli.base.spaces import ActionSpace
 
 PARALLEL = "parallel"
-"""Mode of a round, and of its decode, in which a parallel target decoded all tokens at once."""
+"""Mode of a round in which a parallel target decoded all tokens at once. Also the mode of the decode."""
 
 PHASES = ("vision", "prefill", "propose", "verify", "accept", "rectify", "other")
 """Phases of a decode. Their seconds add up to `DecodeRecord.seconds`. `vision` is the time of `Target.encode`."""
@@ -32,16 +32,16 @@ class Round:
             target did not run) or "parallel" (one forward gave all tokens).
         proposer: Name of the proposer that drafted, or "none".
         start: Number of tokens committed before this round.
-        drafted: The draft tokens that decided the round: the accepted ones and, if the draft was rejected after them,
-            the rejected token that is nearest to the target's.
+        drafted: The accepted draft tokens. If the draft was rejected after them, one rejected token follows: the one
+            that is nearest to the target's token.
         target_tokens: The target's tokens at the positions of `drafted`. If the whole draft was accepted and the chunk
             is not full, the bonus (the target's next token) comes after them.
         accepted: Number of accepted draft tokens.
         committed: Number of committed tokens: the accepted draft tokens and the bonus.
         tree_size: Number of draft tokens in the verified tree.
         threshold: Largest accepted distance per DoF, in bins. Empty if no acceptance rule ran.
-        levels: Number of levels that were drafted for a tree. The nodes that were kept may reach fewer levels. 0: the
-            draft was a chain.
+        levels: Number of levels that were drafted for a tree. The nodes that were kept may reach fewer levels. 0 if
+            the draft was a chain.
     """
 
     mode: str
@@ -59,7 +59,7 @@ class Round:
     def drafter(self) -> str:
         """Name of the proposer that drafted, or "" if no proposer drafted.
 
-        If the round's mode is "skip" or "parallel", the name of the mode.
+        If the round's mode is "skip" or "parallel", this is the mode instead.
         """
         if self.mode in ("skip", PARALLEL):
             return self.mode
@@ -114,8 +114,8 @@ class DecodeRecord:
     def unverified(self) -> int:
         """Number of executed action values that the target did not verify.
 
-        In a skipped or parallel decode these are all numbers of the actions. In any other decode they are the tokens
-        that a rectifier predicted.
+        In a skipped or parallel decode these are all steps × D values of `actions`. In any other decode they are the
+        values that a rectifier predicted.
         """
         return int(self.actions.size) if self.skipped or self.mode == PARALLEL else self.compensated
 
@@ -155,7 +155,7 @@ class Measure:
 
 
 MEAN = Measure()
-"""The measure that `DecodeRecord.variability` holds."""
+"""The measure by which `DecodeRecord.variability` is computed."""
 MEASURES = MEAN, Measure(total=True), Measure(accepted=True), Measure(accepted=True, total=True)
 
 
@@ -217,7 +217,7 @@ class EpisodeRecord:
 
     @property
     def seconds(self) -> float:
-        """Inference time of all decodes; NaN if the episode was not timed."""
+        """Sum of the inference times of all decodes, in seconds. NaN if the episode was not timed."""
         return sum(d.seconds for d in self.decodes)
 
     @property

@@ -1,8 +1,8 @@
-"""Draft tokens as a tree, which an acceptance rule judges. This file imports nothing heavy.
+"""Draft tokens as a tree, which an acceptance rule judges. This file imports neither torch nor numpy.
 
 Node i has a token, a parent and a depth. Parent −1 is the last committed token. Depth 0 is the first drafted position.
 Parents come before their children. After c committed tokens, a node at depth d is token c + d of the chunk. This index
-gives its control step and DoF (docs/methods.md §2).
+gives the node's control step and DoF (docs/methods.md §2).
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class TokenTree:
         return depth if depth < len(self) else 0
 
     def down_from(self, node: int) -> list[int]:
-        """Return the path from `node` down to a leaf, `node` first. At each node it takes the first child."""
+        """Return the path from `node` down to a leaf, `node` first. At each node the path goes to the first child."""
         nodes = [node]
         for i in range(node + 1, len(self)):
             if self.parents[i] == nodes[-1]:
@@ -75,7 +75,7 @@ class TokenTree:
 
 
 def merge(chains: Sequence[Sequence[int]]) -> TokenTree:
-    """Merge several token sequences into one prefix tree. Sequences with a common beginning share its nodes."""
+    """Merge several token sequences into one prefix tree. Sequences share the nodes of a common beginning."""
     tokens: list[int] = []
     parents: list[int] = []
     children: dict[tuple[int, int], int] = {}
