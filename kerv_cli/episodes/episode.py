@@ -21,7 +21,7 @@ from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import World
 
 AT_OBJECT = 0.05
-"""Distance in metres. If the fingertips have been closer than this to the object, its later motion counts as theirs."""
+"""Distance in metres. Once the fingertips were this close to the object, they count as the cause of its motion."""
 
 
 Latency = Callable[[DecodeRecord], float]
@@ -59,7 +59,7 @@ class RealClock:
 
         Args:
             decode: Record of the decode.
-            observed: Control step at which its observation was taken.
+            observed: Control step at which the decode's observation was taken.
 
         Raises:
             KervError: The latency is negative or not finite.
@@ -74,7 +74,7 @@ def moved_after_approach(distances: Sequence[float], objects: Sequence[np.ndarra
     """Return the object's largest displacement, in metres, since the fingertips first came within AT_OBJECT of it.
 
     Earlier motion is ignored, because some objects fall into place at the start. The result is 0 if the fingertips
-    never came that close, and NaN if the task has no object.
+    never came so close to the object, and NaN if the task has no object.
 
     Args:
         distances: Distance between fingertips and object after each step.
@@ -139,8 +139,8 @@ class _Execution:
             delay: How long the decode takes.
 
         Returns:
-            The delay, with two numbers of steps filled in: `carried` steps executed the rest of the previous chunk, and
-            `held` steps repeated the last action.
+            The delay with `carried` and `held` filled in. `carried` is the number of steps that executed the rest of
+            the previous chunk. `held` is the number of steps that repeated the last action.
         """
         before, in_chunk = len(self.actions), len(self.chunk)
         while len(self.actions) < before + delay.steps and not self.world.done:
@@ -164,8 +164,9 @@ def run_episode(
         world: The environment, opened for one task.
         decoder: Decodes the observations.
         seed: Seed of the initial state.
-        camera: View to record, one image per control step; None to record no images.
-        clock: Latency of decodes, if the world goes on meanwhile (docs/methods.md §8); None if the world waits.
+        camera: View to record, one image per control step. None to record no images.
+        clock: Gives the latency of each decode if the world goes on during it (docs/methods.md §8). None if the world
+            waits.
     """
     steps = episode(world, decoder, seed, camera, clock)
     decode: Any = None
@@ -187,15 +188,17 @@ def episode(
 ) -> Generator[Observation, DecodeRecord, EpisodeRecord]:
     """Run one episode like `run_episode`, but let the caller decode.
 
-    The generator yields an observation; send it the record of the decode. At the end it returns the episode's record.
+    The generator yields observations. Send it the record of each observation's decode. At the end it returns the
+    episode's record.
 
     Args:
         world: The environment, opened for one task.
-        follower: Stores the episode's past actions and positions. It is the decoder itself, or the object that a batch
-            decoder has for this episode.
+        follower: Stores the episode's past actions and positions. This is the decoder itself, or what
+            `BatchDecoder.new_episode` returned for this episode.
         seed: Seed of the initial state.
-        camera: View to record, one image per control step; None to record no images.
-        clock: Latency of decodes, if the world goes on meanwhile (docs/methods.md §8); None if the world waits.
+        camera: View to record, one image per control step. None to record no images.
+        clock: Gives the latency of each decode if the world goes on during it (docs/methods.md §8). None if the world
+            waits.
     """
     began = time.perf_counter()
     world.reset(seed)

@@ -58,7 +58,7 @@ class Setting:
         identity: Hashes of the weights and data that the setting reads.
         varies: This setting's values for the keys that differ within its grid, by key. An entry of the study expands
             into a grid of settings if an override has several values.
-        name: Name of the grid. Empty: the label.
+        name: Name of the grid. If empty, it becomes the label.
     """
 
     label: str
@@ -87,7 +87,7 @@ class Setting:
 
     @property
     def batch(self) -> int:
-        """Number of episodes that run at the same time. If it is more than 1, they are not timed."""
+        """Number of episodes that run at the same time. If it is more than 1, the episodes are not timed."""
         return int(self.settings["rollout"]["batch"])
 
     def on(self, *tasks: str) -> RolloutSettings:
@@ -96,11 +96,11 @@ class Setting:
 
 
 def differences(new: Setting, old: Setting | None = None, work: str = "") -> str:
-    """Describe in a few words how a setting differs from a stored one with the same label.
+    """Describe in a few words how a setting differs from the stored setting with the same label.
 
     Args:
         new: The setting.
-        old: The stored setting. None: no setting is stored.
+        old: The stored setting. None if no setting with this label is stored.
         work: The hash under which `old` was stored.
     """
     target = new.settings["policy"]["target"]
@@ -299,8 +299,8 @@ _COMPUTING = ("base", "engine", "methods", "targets", "worlds", "episodes")
 def code_hash() -> str:
     """Return a hash of the code that computes episodes, as hexadecimal SHA-256.
 
-    Episodes are stored with this hash, so that those computed by other code can be found. It covers the syntax trees of
-    kerv's own files and of registered plugins. Comments, docstrings and formatting do not change it.
+    Episodes are stored with this hash, so that episodes computed by other code can be found. The hash covers the syntax
+    trees of kerv's own files and of registered plugins. Comments, docstrings and formatting do not change it.
     """
     digest = hashlib.sha256()
     gc.disable()  # syntax trees hold no cycles, and a search among all objects of the libraries takes as long as they

@@ -35,7 +35,7 @@ WARM_UP_DECODES = 6
 
 
 def artifacts_of(settings: MethodSettings) -> Artifacts:
-    """Return the policy's files (weights, datastore, …), to be loaded onto its device when needed.
+    """Return the policy's files (weights, datastore, …). Each is loaded onto the device of the settings when needed.
 
     All settings in this process share the loaded objects.
     """
@@ -114,10 +114,10 @@ def _check_clock(settings: RolloutSettings, spec: EnvironmentSpec, target: Targe
     Args:
         settings: The rollout's settings.
         spec: The environment.
-        target: The policy's description; None for the expert.
+        target: The policy's description. None for the expert.
 
     Returns:
-        `{"profile": HASH}` with the SHA-256 of the profile that the rollout reads; empty if it reads none.
+        `{"profile": HASH}` with the SHA-256 of the profile that the rollout reads. Empty if it reads no profile.
 
     Raises:
         UsageError: An episode would end before its first action, or all actions of a chunk are too old when they
@@ -166,7 +166,7 @@ def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
 
 
 def method_decoder(settings: RolloutSettings, task: str = "") -> Decoder:
-    """Return the decoder of a setting's method, not warmed up. Without a task the method must work on any task."""
+    """Return the decoder of a setting's method, not warmed up. Without `task`, the method must work on any task."""
     artifacts = artifacts_of(settings)
     decoder = Method.of(settings).decoder(artifacts.target, artifacts.load, task)
     decoder.deviation_every = settings.deviation_every

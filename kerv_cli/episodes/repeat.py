@@ -20,13 +20,13 @@ def repeating_words(settings: Plain, identity: Identity, typed: str, task: str, 
 
     Args:
         settings: The stored settings.
-        identity: Hashes of the weights and data that they use.
+        identity: Hashes of the weights and data that the stored settings use.
         typed: Overrides that defined the setting in its study.
         task: Name of the task.
-        seeds: Seeds of the episodes, which must be successive. All are recorded.
+        seeds: Seeds of the episodes, which must be successive. The command records all these episodes.
 
     Raises:
-        UsageError: No command gives these settings, because the presets in conf/ have changed or the seeds have gaps.
+        UsageError: No command repeats the episodes, because the presets in conf/ have changed or the seeds have gaps.
     """
     if list(seeds) != list(range(seeds[0], seeds[0] + len(seeds))):
         raise UsageError("its skip rule adapts from episode to episode, and the seeds before it have gaps")

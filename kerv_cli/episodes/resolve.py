@@ -21,7 +21,7 @@ from kerv_cli.methods.settings import EXPERT
 from kerv_cli.worlds import resolve_tasks, settled, spec_of
 
 MOST_SEEDS = 10_000
-"""Seeds of a block for rollouts, large enough that all their episodes form a single block."""
+"""Number of seeds in a block of a rollout. It is so large that all seeds of a task usually form one block."""
 
 
 @dataclass(frozen=True)
@@ -89,9 +89,9 @@ class ResolvedStudy:
 
     @property
     def unseen(self) -> dict[str, list[str]]:
-        """The study's tasks that a target was not trained on, by target.
+        """For each target of the study, the study's tasks that this target was not trained on.
 
-        Targets that do not name their training tasks are left out.
+        Targets that do not name their training tasks, or were trained on all tasks of the study, are left out.
         """
         found: dict[str, list[str]] = {}
         for one in self.settings.values():
@@ -190,7 +190,7 @@ def _line_of(path: Path, typed: Collection[str], place: str, others: Mapping[str
 
 
 def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
-    """Compose the settings of `kerv rollout`. With -m, compose one for each combination of the values in comma lists.
+    """Compose the settings of `kerv rollout`. With -m, compose one setting per combination of values in comma lists.
 
     Every setting runs on all tasks. The baseline is the first autoregressive setting. If there is none, it is the first
     setting. A label consists of the method's name, the parts that replace the method's own, and the values that vary.
@@ -227,13 +227,19 @@ def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
 
 
 def _settle(settings: Iterable[RolloutSettings], baseline: RolloutSettings, narrows: bool = False) -> None:
-    """Fill in tasks, camera and horizon of all settings, as the baseline has them.
+    """Fill in the tasks, camera and horizon of settings that do not name them.
+
+    The tasks are the baseline's. Camera and horizon are the environment's defaults.
 
     Args:
         settings: The settings to change.
         baseline: The baseline's settings.
-        narrows: Whether to keep only tasks that the baseline's target was trained on. If none is left, all tasks that
-            it was trained on are used.
+        narrows: Whether to keep, in all settings, only the baseline's tasks that its target was trained on. If no task
+            is left, all tasks that this target was trained on are used.
+
+    Raises:
+        UnknownName: A task does not exist, or the environment has no such camera.
+        UsageError: The horizon is longer than the simulator can run.
     """
     tasks = list(tasks_of(baseline))
     trained = list(trained_tasks(baseline)) if narrows else []
@@ -249,14 +255,14 @@ def _is_ar(settings: RolloutSettings) -> bool:
 
 
 def idle_overrides(resolved: ResolvedStudy, sweep: bool = True) -> dict[str, str]:
-    """Return overrides that have no effect, each with the reason.
+    """Return the overrides that have no effect, each with the reason.
 
     If the study has several settings, an override in its file is returned as `LABEL: KEY=VALUE`. An override from the
     command line is returned only if it has no effect on any setting.
 
     Args:
         resolved: The study or rollout.
-        sweep: Whether it is a study, whose episodes may run in several processes.
+        sweep: Whether `resolved` is a study, whose episodes may run in several processes.
     """
     reasons: dict[str, str] = {}
     in_each = []
@@ -272,6 +278,8 @@ def idle_overrides(resolved: ResolvedStudy, sweep: bool = True) -> dict[str, str
 def tasks_of(settings: RolloutSettings) -> tuple[str, ...]:
     """Return the full names of a rollout's tasks. By default they are the tasks that its target was trained on.
 
+    If the target does not name its training tasks, the default is DEFAULT_TASKS.
+
     Raises:
         UnknownName: A task does not exist.
         CheckpointError: The target's description is damaged.
@@ -282,7 +290,7 @@ def tasks_of(settings: RolloutSettings) -> tuple[str, ...]:
 def trained_tasks(settings: RolloutSettings) -> tuple[str, ...]:
     """Return the full names of the tasks that a rollout's target was trained on.
 
-    Empty for the expert, for a target that does not name its tasks, and for a missing target (`check` reports that).
+    Empty for the expert, for a target that does not name its tasks, and for a missing target (refused elsewhere).
 
     Raises:
         CheckpointError: The target's description is damaged.
@@ -303,7 +311,8 @@ def study_name(study: str) -> str:
     """Return the name under which the results of `kerv sweep study=STUDY` are stored.
 
     Args:
-        study: Name of a preset, or path of a file. For a file the name is its `name:` entry, or else its file name.
+        study: Name of a preset, or path of a file. For a file the result is its `name:` entry, or else the file's name
+            without suffix.
 
     Raises:
         UsageError: The file exists but is not a study.

@@ -18,7 +18,7 @@ from kerv_cli.engine.record import PHASES, DecodeRecord, Delay, EpisodeRecord, R
 
 INT, FLOAT, TEXT, FLAG = pa.int64(), pa.float64(), pa.string(), pa.bool_()
 Fields = dict[str, tuple[pa.DataType, Callable[..., Any]]]
-"""Column -> its type, and the function that reads its value from a record."""
+"""Columns by name. Each has a type, and a function that reads the column's value from a record."""
 
 
 def _summed(value: Callable[[DecodeRecord], Any]) -> Callable[[EpisodeRecord], Any]:
@@ -41,7 +41,11 @@ def _phase(phase: str) -> Callable[[DecodeRecord], float | None]:
 
 
 def _columns(*names: str, kind: pa.DataType = INT, read: Callable[[str], Any] = attrgetter, as_: str = "{}") -> Fields:
-    """Return columns of one type. `read` gets a name, and returns the function that reads its value from a record."""
+    """Return one column for each name, all of the type `kind`.
+
+    `read(name)` returns the function that reads the column's value from a record. `as_` is the pattern of the columns'
+    names, such as `seconds.{}`.
+    """
     return {as_.format(name): (kind, read(name)) for name in names}
 
 
@@ -93,7 +97,7 @@ def _row(columns: Fields, record: object) -> dict[str, Any]:
 
 
 EPISODE_SCHEMA = _schema(_EPISODE)
-"""Columns that are computed from an episode's record. The database adds others, such as the task and the time."""
+"""Columns that are computed from an episode's record. The database adds more columns, such as task and time."""
 
 _TOKENS = pa.list_(pa.int32())
 _OF_ROUND = {"str": TEXT, "int": pa.int32(), "tuple[int, ...]": _TOKENS}
@@ -146,11 +150,11 @@ def table_blob(table: pa.Table) -> bytes:
 
 
 def read_decodes(blob: bytes, columns: Sequence[str] | None = None) -> pa.Table:
-    """Return the table of decodes in the bytes that `table_blob` wrote.
+    """Read a table of decodes from bytes that `table_blob` returned.
 
     Args:
-        blob: A Parquet file.
-        columns: Columns to read; None for all.
+        blob: The bytes of a Parquet file.
+        columns: Names of the columns to read. None for all.
     """
     return pq.read_table(io.BytesIO(blob), columns=columns, use_threads=False)
 
@@ -162,7 +166,7 @@ _SAME = (
 
 
 def decode_records(table: pa.Table) -> list[DecodeRecord]:
-    """Return the decodes in a table that `decodes_table` made."""
+    """Return one record for each row of a table that `decodes_table` made."""
     return list(map(_decode_record, table.to_pylist()))
 
 

@@ -38,7 +38,7 @@ OpenWorld = Callable[[str], World]
 """Opens a new world for a task."""
 
 TOGETHER = 16
-"""Episodes that run at once in the validation of a training. With rendering, their worlds take 1.5 GB."""
+"""Number of episodes that run at once in the validation of a training. With rendering, their worlds take 1.5 GB."""
 
 _WORLDS = 4  # kept open per process; one with rendering takes about 90 MB
 _opened: OrderedDict[tuple[str, CameraSettings, int], World] = OrderedDict()  # the most recently used one is last
@@ -77,9 +77,9 @@ def close_worlds() -> None:
 
 
 class Runner:
-    """Runs episodes of one setting (a method with all its options) on one task. Its decoder is built only once.
+    """Runs episodes of one setting (a method with all its options) on one task. The decoder is built only once.
 
-    Its episodes may alternate with those of other runners, because decoders share no state.
+    The episodes may alternate with episodes of other runners, because decoders share no state.
     """
 
     def __init__(self, settings: RolloutSettings, task: str) -> None:
@@ -110,7 +110,7 @@ class Request(Generic[K]):
 
 
 EpisodeEnd = tuple[Request[K], EpisodeRecord | Exception]
-"""A request, with the record of its episode or the error that its world raised."""
+"""A request, with the record of its episode or the error that ended the episode."""
 
 
 def run_together(
@@ -118,8 +118,8 @@ def run_together(
 ) -> Iterator[EpisodeEnd[K]]:
     """Run several episodes at once. Yield each request when its episode ends, with the record or the error.
 
-    The batch has up to `batch` slots. Each slot runs one episode after another. A slot opens a world when an episode
-    needs one, and keeps it while the task has episodes left, because opening a world takes longer than resetting one.
+    The batch has up to `batch` slots. Each slot runs one episode after another. A slot opens a world for an episode,
+    and keeps this world while its task has episodes left, because opening a world takes longer than resetting it.
 
     Args:
         decoder: Decodes the observations of all running episodes together.
@@ -157,13 +157,13 @@ def _one_after_another(
 ) -> Generator[Observation, DecodeRecord, None]:
     """Run waiting episodes one after another, until none is left.
 
-    A batch runs several of these generators at once, one in each of its slots. The generator yields an observation;
-    send it the record of the decode.
+    A batch runs several of these generators at once, one in each of its slots. The generator yields observations. Send
+    it the record of each observation's decode.
 
     Args:
         state: Follows the episodes of this slot of the batch, one after another.
-        waiting: Requests that have not begun. If possible, the next one has the same task as the last.
-        ended: Each request is appended when it ends, with the record of its episode or its error.
+        waiting: Requests that have not begun, shared by all slots. A slot takes requests of the same task if it can.
+        ended: List to which each request is appended when its episode ends, with the episode's record or error.
         open_world: Opens a world for a task.
     """
     world: World | None = None
@@ -189,14 +189,17 @@ def _one_after_another(
 
 
 def _take(waiting: list[Request[K]], task: str) -> Request[K]:
-    """Remove and return a waiting request: one of `task`, else one of the task with the most requests."""
+    """Remove a waiting request of `task` from the list, and return it.
+
+    If there is none of `task`, take a request of the task with the most waiting requests.
+    """
     tasks = [request.task for request in waiting]
     wanted = task if task in tasks else Counter(tasks).most_common(1)[0][0]
     return waiting.pop(tasks.index(wanted))
 
 
 def run_batch(settings: RolloutSettings, requests: Iterable[Request[K]]) -> Iterator[EpisodeEnd[K]]:
-    """Run episodes of one setting, `rollout.batch` at a time, without recording images.
+    """Run episodes of one setting, `rollout.batch` at a time, without recording images. Yield as `run_together` does.
 
     Args:
         settings: The rollout's settings.
@@ -211,8 +214,8 @@ def run_batch(settings: RolloutSettings, requests: Iterable[Request[K]]) -> Iter
 def is_recorded(settings: RolloutSettings, seed: int) -> bool:
     """Return whether images of the episode with this seed are recorded.
 
-    The first `settings.record` episodes of each task are recorded, or all if the number is negative. A batch of several
-    episodes is never recorded.
+    The first `settings.record` episodes of each task are recorded, or all if this number is negative. Episodes that run
+    in a batch are never recorded.
 
     Raises:
         UsageError: The episode should be recorded, and Rerun is not installed.
@@ -226,7 +229,7 @@ def is_recorded(settings: RolloutSettings, seed: int) -> bool:
 def success_of(target: Target, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:
     """Run one episode per task and seed, and return the share of successful episodes, in [0, 1].
 
-    The target decodes as it was trained to, autoregressively or in parallel.
+    The target decodes as it was trained to, autoregressively or in parallel. An error in an episode is raised.
     """
     decoder = BatchDecoder(native_decoder(target))
     requests = [Request(None, task, seed) for task, seed in itertools.product(tasks, seeds)]

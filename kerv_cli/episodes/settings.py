@@ -14,7 +14,7 @@ from kerv_cli.worlds.settings import EVALUATION_SEED, RolloutWorldSettings
 WAITS, REAL = "waits", "real"
 MEASURED, CONSTANT, PROFILE = "measured", "constant", "profile"
 CHUNK = "chunk"
-"""Value of `rollout.delay_compensation`: do not execute actions of a new chunk that are already too old."""
+"""Value of `rollout.delay_compensation`. Actions of a new chunk that are already too old are then not executed."""
 
 
 @dataclass
@@ -102,7 +102,7 @@ class StudySettings:
 class SweepSettings(CommandSettings):
     """Settings of `kerv sweep`, which runs a study: a comparison of several settings.
 
-    All other overrides on the command line apply to every setting of the study.
+    Overrides on the command line that name none of these settings apply to every setting of the study.
     """
 
     groups: ClassVar = {"study": "threshold"}
