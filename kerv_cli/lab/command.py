@@ -1,4 +1,7 @@
-"""The command that this process runs: its command-line arguments and its database. This file imports nothing heavy."""
+"""The command that this process runs: its command-line arguments and its database.
+
+This file imports only the standard library.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from contextvars import ContextVar
 from urllib.parse import unquote
 
 STORE = "KERV_STORE"
-"""Environment variable with the URL of the database. If empty, it is a SQLite file in the results folder."""
+"""Environment variable with the URL of the database. If it is empty, the SQLite file in the results folder is used."""
 _words: ContextVar[tuple[str, ...]] = ContextVar("words", default=())
 _store: ContextVar[str] = ContextVar("store", default="")
 
@@ -21,7 +24,7 @@ def current_command() -> list[str]:
 
 
 def current_store() -> str:
-    """Return the URL of the database that this command uses. Empty: the SQLite file in the results folder."""
+    """Return the URL of the database that this command uses. Empty for the SQLite file in the results folder."""
     return _store.get() or os.environ.get(STORE, "")
 
 
@@ -40,7 +43,7 @@ def noted(words: Sequence[str]) -> Iterator[None]:
 
 
 def without_passwords(url: str) -> str:
-    """Return a database's URL without passwords. They can be before the host and in the query."""
+    """Return a database's URL without passwords, which can be before the host and in the query."""
     address, _, query = re.sub(r"(://[^/@:]*):[^/@]*@", r"\1@", url).partition("?")
     pairs = [one for one in query.split("&") if not unquote(one.partition("=")[0]).lower().endswith("password")]
     return "?".join(filter(None, (address, "&".join(pairs))))
@@ -54,8 +57,8 @@ def chosen_store(overrides: Iterable[str]) -> Iterator[list[str]]:
         overrides: Overrides of a command. Without `store=`, the block uses the same database as the code before it.
 
     Yields:
-        The same overrides, but the URL has no password, so that the password is never stored. The URL is quoted if
-        Hydra needs quotes.
+        The overrides, with `store=` changed: its URL has no password, so that no password is ever stored. The URL is
+        quoted if Hydra needs quotes.
     """
     overrides, chosen = list(overrides), _store.get()
     for number, override in enumerate(overrides):

@@ -42,7 +42,7 @@ class Unanswered(StorageError):
 
 
 class Damaged(ValueError):
-    """A stored value has the wrong type or form for its column. `Database.reading` raises a CheckpointError instead."""
+    """A stored value has the wrong type or form for its column. `Database` turns this into a CheckpointError."""
 
 
 def _is_time(text: str) -> bool:
@@ -58,7 +58,7 @@ class _Checked(sa.types.TypeDecorator[Any]):
 
     Args:
         kind: Type of the values in Python. Objects and lists are stored as JSON.
-        check: Says whether a value is valid, or raises ValueError. None: every value of this type is.
+        check: Says whether a value is valid, or raises ValueError. If None, every value of the type is valid.
     """
 
     impl: Any = sa.Text
@@ -77,7 +77,7 @@ class _Checked(sa.types.TypeDecorator[Any]):
         return value
 
     def result_processor(self, dialect: sa.Dialect, coltype: object) -> Any:
-        """Return the function that turns a stored value into Python's."""
+        """Return the function that turns a stored value into a value of Python. It raises Damaged for a wrong value."""
         inner = super().result_processor(dialect, coltype)
 
         accepted = (float, int) if self.kind is float else self.kind
@@ -106,7 +106,7 @@ def _required(kind: Any, *names: str) -> list[sa.Column[Any]]:
 
 
 def _to(name: str, column: str, **options: Any) -> sa.Column[Any]:
-    """Return a column that refers to a row of another table. A row is deleted together with that other row."""
+    """Return a column that refers to a row of another table. If that row is deleted, rows that refer to it are, too."""
     return sa.Column(name, sa.ForeignKey(column, ondelete="CASCADE"), **options)
 
 
@@ -151,7 +151,7 @@ BLOCKS = _table(
 )
 _TYPES = {FLAG: sa.Boolean, INT: sa.BigInteger, FLOAT: sa.Double}
 MEASURES = tuple(sa.Column(field.name, _TYPES.get(field.type, sa.JSON(none_as_null=True))) for field in EPISODE_SCHEMA)
-"""Columns from an episode's record."""
+"""Columns of the table of episodes that are computed from an episode's record."""
 EPISODES = _table(
     "episodes",
     sa.Column("id", sa.Integer, primary_key=True),
@@ -203,16 +203,16 @@ def now() -> str:
 class Database:
     """The tables of one results folder.
 
-    The first write creates the database. Until then, all tables read as empty.
+    The first write creates the database. Until then, all tables read as empty. Methods that read or write raise a
+    StorageError if the server does not answer, or if the disk is full or not writable. They raise a CheckpointError if
+    the file is damaged, or was written by a newer version of kerv.
 
     Args:
         results: The results folder.
-        url: URL of the database. Empty: the SQLite file in the results folder.
+        url: URL of the database. If empty, the SQLite file in the results folder is used.
 
     Raises:
-        UsageError: The URL cannot be used.
-        StorageError: The server does not answer, or the disk is full or not writable.
-        CheckpointError: The file is damaged, or was written by a newer version of kerv.
+        UsageError: The URL or the results folder cannot be used.
     """
 
     def __init__(self, results: str | Path, url: str | sa.URL = "") -> None:
@@ -265,7 +265,7 @@ class Database:
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[sa.Connection]:
-        """Yield a connection for reading. If there is no database yet, yield one with empty tables.
+        """Yield a connection for reading. If there is no database yet, its tables are empty.
 
         Raises:
             StorageError: The database cannot be read, or its file was written during reading.
@@ -372,8 +372,8 @@ class Database:
 def opened(results: str | Path) -> Database:
     """Return the database that the running command uses for a results folder.
 
-    `store=` names the database. Without it, the variable KERV_STORE does. Without both, it is the SQLite file in the
-    folder. A command calls this function once and passes the database on.
+    `store=` names the database. Without it, the variable KERV_STORE names it. Without both, it is the SQLite file in
+    the folder. A command calls this function once and passes the database on.
     """
     return Database(results, current_store())
 
@@ -408,7 +408,7 @@ def _server(url: sa.URL) -> sa.Engine:
 
 
 _CHANGED = "changed"
-"""Key of a connection's `info`: when the file was changed, if the connection takes no locks."""
+"""Key in the `info` of a connection that takes no locks. The value is the time of the file's last change."""
 
 
 class _Unlocked(sqlite3.Connection):

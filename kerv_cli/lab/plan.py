@@ -27,8 +27,8 @@ FULL_BATCHES = 16
 NEVER, TIMED, CHANGED, ALL = "never", "timed", "changed", "all"
 """Values of `rerun=`, which says which existing episodes to run again.
 
-NEVER: none. TIMED: those that did not take turns with all other settings in one block. CHANGED: those that ran with
-another version of the code. ALL: all.
+NEVER runs no existing episode again. TIMED runs the episodes again that did not take turns with all other settings in
+one block. CHANGED runs the episodes again that ran with another version of the code. ALL runs all episodes again.
 """
 
 Key = tuple[str, str, int, int]
@@ -192,7 +192,7 @@ def split(
         rerun: Which existing episodes to run again: none (NEVER), those whose settings did not take turns in one block
             (TIMED), those that ran with another version of the code (CHANGED), or all (ALL).
         since: Used only with ALL, if a command is resumed: the time at which it first began (ISO 8601). Episodes of
-            blocks that began later count as existing, because this command ran them. Empty: all episodes run again.
+            blocks that began later count as existing, because this command ran them. If empty, all episodes run again.
         earlier: The newest stored setting and its hash, by label. Used to explain what has changed.
 
     Returns:
@@ -223,7 +223,11 @@ def split(
 def _rows_of_turn(
     turn: Sequence[Episode], usable: Mapping[Episode, Sequence[StoredEpisode]]
 ) -> dict[Episode, StoredEpisode]:
-    """Choose one row per stored episode: from the block that ran most of the turn, or else the newest."""
+    """Choose one stored row for each episode of a turn (see `_turns`). Episodes without a row are left out.
+
+    If an episode has several rows, choose the row of the block that ran most episodes of the turn. If several blocks
+    ran equally many, choose the newest row.
+    """
     in_block: Counter[str] = Counter()
     for one in turn:
         in_block.update(map(attrgetter("block"), usable[one]))
@@ -318,9 +322,9 @@ def blocks_of(episodes: Iterable[Episode], block: int, workers: int = 1) -> list
     """Group episodes into blocks, each to be run by one process.
 
     A block holds one task, one repeat, one number of threads, and up to `block` successive seeds, for which the same
-    settings must run. If different settings must run for some seeds, those seeds get a block of their own. But the
-    seeds of a setting whose results depend on their order are never split. Episodes that run as a batch are grouped by
-    setting instead, into blocks small enough that every worker gets one.
+    settings must run. If different settings must run for some seeds, those seeds get a block of their own. But if a
+    setting's results depend on the order of its seeds, its seeds are never split. Episodes that run as a batch are
+    grouped by setting instead, into blocks small enough that every worker gets one.
 
     Args:
         episodes: The episodes to run.

@@ -11,7 +11,7 @@ import psycopg
 STATEMENT_SECONDS = 30
 """Longest time that a statement may take, waiting for other transactions included, seconds."""
 IDLE_SECONDS = 20
-"""Longest time between two statements of a transaction, seconds. It holds locks for which other workers wait."""
+"""Longest time between two statements of a transaction, seconds. A transaction may hold locks for which others wait."""
 CONNECT_SECONDS = 5
 """Longest time to wait for a connection, seconds."""
 _SPARE_SECONDS = 5
@@ -35,10 +35,12 @@ class Connection(psycopg.Connection[Any]):
 
 
 def _limited(gen: Any, seconds: float) -> Generator[Any, Any, Any]:
-    """Forward a generator of psycopg, with a time limit. It yields what it waits for, and gets 0 while nothing comes.
+    """Run a generator of psycopg with a time limit, and return its result.
+
+    The generator yields what it waits for. The caller sends 0 while nothing has come from the server.
 
     Raises:
-        TimeoutError: Nothing has come for this many seconds.
+        TimeoutError: Nothing has come from the server for more than `seconds`.
     """
     try:
         wanted, heard = next(gen), time.monotonic()

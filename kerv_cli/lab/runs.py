@@ -38,7 +38,8 @@ STALE_SECONDS = 900.0
 """A run on another machine counts as dead after this many seconds without a heartbeat."""
 
 _open: set[str] = set()
-"""Ids of this process's runs that have not ended. The database may miss an end, because the disk was full."""
+"""Ids of this process's runs that have not ended. A run that has ended may still be `running` in the database, because
+its end could not be written."""
 
 
 @dataclass(frozen=True)
@@ -105,14 +106,15 @@ def time_left(row: RunRow) -> str:
 def time_of(database: Database, kind: str, command: Sequence[str], units: int = 0) -> str:
     """Estimate how long a command will take, from an earlier command with the same options on this machine.
 
-    Names, tasks and numbers of steps or episodes may differ. Of several earlier commands, the one with the most similar
-    number of units is used, then the newest. Resumed and repeated commands are not used.
+    Names, tasks and numbers of steps or episodes may differ. Of several earlier commands, the command with the most
+    similar number of units is used. If several are equally similar, the newest of them is used. Resumed and repeated
+    commands are not used.
 
     Args:
         database: The database.
         kind: Kind of the artifact that the command makes.
         command: Command-line arguments after `kerv`.
-        units: Number of steps or episodes. 0: as many as the earlier command had.
+        units: Number of steps or episodes. If 0, as many are assumed as the newest earlier command had.
 
     Returns:
         The duration and the earlier command's artifact as text. If there is no such command, the text says so.
@@ -134,7 +136,7 @@ def time_of(database: Database, kind: str, command: Sequence[str], units: int = 
 
 
 _SIZES = ("name", "task", "demos", "episodes", "seed", "train.steps", "results", "store", "policy.target")
-"""Settings in which two commands may differ although they work at the same speed."""
+"""Settings in which two commands may differ although they need the same time per step or episode."""
 
 
 def _options(command: Sequence[str]) -> set[str]:
@@ -174,7 +176,7 @@ class Run:
         database: Where the row is written.
         kind: sweep, rollout, import, or the kind of artifact (weights or data) that the command makes.
         name: Name of the study or artifact.
-        command: Command-line arguments (without `kerv`) that resume the command. Empty: `current_command()`.
+        command: Command-line arguments (without `kerv`) that resume the command. If empty, `current_command()`.
         total: Number of steps or episodes.
         alone: Whether to refuse to start while another process makes the same study or artifact.
 
@@ -223,11 +225,11 @@ class Run:
         return self
 
     def beat(self, done: int, total: int | None = None) -> None:
-        """Note progress. It is written with the next heartbeat, or immediately if `total` changes.
+        """Note progress, to be written with the next heartbeat. If `total` changes, it is written at once.
 
         Args:
             done: Number of steps or episodes that are finished.
-            total: Number of steps or episodes in all. None: the total does not change.
+            total: Number of steps or episodes in all. If None, the total does not change.
         """
         is_new = total not in (None, self.total)
         self.done, self.total = done, self.total if total is None else total
@@ -265,7 +267,7 @@ class Run:
                 raise
 
     def _was_refused(self, error: BaseException | None) -> bool:
-        """Return whether the command was refused: it is impossible, or its input cannot be read and it made nothing."""
+        """Return whether the command was refused: by a UsageError, or by a CheckpointError before it made anything."""
         if not isinstance(error, CheckpointError):
             return isinstance(error, UsageError)
         with self.database.reading() as connection:
@@ -302,16 +304,16 @@ def command_to_go_on(database: Database, kind: str, folder: Path) -> tuple[str, 
 
 
 def interrupted(database: Database, kind: str, command: Sequence[str], name: str | None = None) -> RunRow | None:
-    """Return the row of an interrupted command: of its first attempt after it was complete for the last time.
+    """Return the row of a command that did not complete. If it was tried several times, return the first try's row.
 
-    None if the command has no row, or if its newest row is complete. Also None if another command has made the same
-    study or artifact since.
+    Tries before the command was last complete do not count. None if the command has no row, or if its newest row is
+    complete. Also None if another command has made the same study or artifact since.
 
     Args:
         database: The database.
         kind: Kind of the study or artifact.
         command: Command-line arguments (without `kerv`).
-        name: Name of the study or artifact. None: the name in the command's newest row.
+        name: Name of the study or artifact. If None, the name in the command's newest row.
     """
     first, rows = None, run_rows(database, kind, name)
     name = next((row.name for row in rows if row.command == tuple(command)), None)

@@ -59,7 +59,7 @@ class ImportedEpisode:
         decodes: Decodes of the episode, a table with the columns of rows.DECODE_SCHEMA.
         block: Id of the block (episodes that one process ran) in which it ran.
         about: Machine and versions that ran the block.
-        run: Id of the run (the command that ran it). Empty: the run that imports it.
+        run: Id of the run (the command that ran it). If empty, the run that imports the episode is stored.
         seeds: Seeds of the block, as `seeds_text` writes them.
         code: Hash of the code that ran it.
     """
@@ -77,7 +77,7 @@ class ImportedEpisode:
 def _same_episode() -> sa.ColumnElement[bool]:
     """Return the SQL condition that joins a study's planned episodes to all stored rows of the same episodes.
 
-    WANTED joined to SETTINGS has the planned episodes, EPISODES the stored ones.
+    WANTED joined to SETTINGS has the planned episodes. EPISODES has the stored episodes.
     """
     of_setting = EPISODES.c.work == SETTINGS.c.work, EPISODES.c.task == WANTED.c.task
     return sa.and_(*of_setting, EPISODES.c.seed == WANTED.c.seed, EPISODES.c.repeat == WANTED.c.repeat)
@@ -93,12 +93,12 @@ class Study:
     Attributes:
         database: The database.
         name: Name in the database.
-        kind: sweep, rollout or import. If left out: as stored in the database, or sweep if the study is not stored.
+        kind: sweep, rollout or import. If left out, it is read from the database, or sweep if the study is not stored.
         settings: The settings to compare.
         episodes: All episodes, in the order in which they run.
         title: Title of the report.
         baseline: Label of the setting that the others are compared with.
-        axis: Configuration key on the x axis of plots. Empty: no plot.
+        axis: Configuration key on the x axis of plots. If empty, they show speed and success of each setting.
         note: A sentence printed in the report.
         block: Number of seeds in a block, which one process runs. For each of these seeds it runs all settings.
         machines: Names of cost profiles of other machines, on which the report estimates the speeds.
@@ -152,7 +152,7 @@ class Study:
 
     @functools.cached_property
     def blocks(self) -> list[Block]:
-        """The episodes to run in blocks, each of which one process runs. Blocks are ordered by their first episode."""
+        """The episodes to run, grouped into blocks. One process runs a block. Blocks are ordered by first episode."""
         return blocks_of(self.to_run, self.block, self.runtime.workers)
 
     @property
@@ -193,7 +193,7 @@ class Study:
         """Return the newest command that ran the study as a sweep, or `kerv sweep study=NAME` if none is stored.
 
         Args:
-            overrides: Further overrides to append.
+            overrides: Further overrides to append. They replace stored overrides of the same keys.
         """
         typed: Sequence[str] = ("sweep", f"study={self.name}")
         for row in run_rows(self.database, SWEEP, self.name):
@@ -234,7 +234,7 @@ class Study:
         Args:
             rerun: Which existing episodes to run again: NEVER, TIMED, CHANGED or ALL (`lab/plan.py`).
             since: Used only with ALL, if an interrupted command is resumed: the time at which that command began (ISO
-                8601). Empty: all episodes run again.
+                8601). If empty, all episodes run again.
             runtime: Executor, workers and device.
             command: Command-line arguments (without `kerv`) that resume the study.
         """
@@ -252,7 +252,7 @@ class Study:
 
         Args:
             newer_than: Return only rows with a larger row number.
-            block: Return only rows of this block's settings, tasks and seeds. None: of all the study's settings.
+            block: Return only rows of this block's settings, tasks and seeds. If None, rows of all the settings.
         """
         stored: dict[Key, list[StoredEpisode]] = {}
         columns = (
@@ -325,7 +325,7 @@ class Study:
         return int(row.id)
 
     def counts(self) -> tuple[int, int]:
-        """Return how many of the study's planned episodes have been run, and how many are planned in all."""
+        """Return how many of the study's planned episodes have been run, and how many episodes are planned."""
         with self.database.reading() as connection:
             row = connection.execute(
                 sa.select(sa.func.count(WANTED.c.episode_id), sa.func.count())
@@ -361,7 +361,7 @@ class Study:
 
         Args:
             episodes: Only these episodes; None for all.
-            run: Only episodes that the command with this id ran. None: the episodes that the study uses now.
+            run: Only episodes that the command with this id ran. If None, the episodes that the study uses now.
         """
         import numpy as np
         import pandas as pd
@@ -462,7 +462,7 @@ class Study:
     def update(self, connection: sa.Connection, one: Episode, **values: Any) -> None:
         """Change this study's rows of an episode in the table WANTED (planned episodes).
 
-        An episode has several rows if settings with different labels mean the same, and so share the episode.
+        An episode has several rows if settings with different labels have the same hash `work`, and so share it.
         """
         settings = sa.select(SETTINGS.c.id).join(STUDIES).where(STUDIES.c.name == self.name)
         settings = settings.where(SETTINGS.c.work == one.setting.work)

@@ -44,7 +44,7 @@ from kerv_cli.lab.workers import Array, LocalWorkers, gpus_in_turn
 
 SLURM = "slurm"
 FOLLOW_SECONDS = 0.3
-"""Seconds between two looks at the database while other processes run the blocks."""
+"""Seconds between two queries of the database while other processes run the blocks."""
 
 
 def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], kind: str = SWEEP) -> Study:
@@ -122,7 +122,7 @@ class Outcome:
 
 
 def run(study: Study, on_event: OnEvent = lambda event: None, *, save: Save = lambda *_: None) -> Outcome:
-    """Run the missing episodes of a plan. Each is saved in the database as soon as it ends.
+    """Run the missing episodes of a plan. Each episode is saved in the database as soon as it ends.
 
     Args:
         study: The study with its plan.
@@ -229,7 +229,7 @@ class Progress:
         on_event(Started(len(self._missing), len(study.existing), load_per_core() if is_timed else 0.0))
 
     def see(self, event: Event) -> None:
-        """Take an event of a worker in this process."""
+        """Update the outcome with an event, and pass the event on to `on_event`."""
         if isinstance(event, EpisodeEnd):
             one = self._missing.pop(event.episode.key, None)
             if one is None:
@@ -314,7 +314,7 @@ class Progress:
 
 
 class TimeLeft:
-    """Estimates how long the missing episodes of a plan take, and corrects that with each episode that ends.
+    """Estimates how long the missing episodes of a plan take, and corrects the estimate when an episode ends.
 
     An episode is expected to take the mean time of its setting's finished episodes. A setting without finished episodes
     gets the average of the other settings' means. The workers share the total equally.

@@ -5,8 +5,8 @@ episodes that are running. Another worker runs the rest of its block. If two wor
 setting fails in this block.
 
 The blocks that wait or run are in the queue, a table of the database. A claim lasts as long as the worker writes its
-heartbeat. The database's own clock decides, because the clocks of two machines may differ. Every change is one
-transaction, and a database has one writer at a time.
+heartbeat. Times are those of the database's own clock, because the clocks of two machines may differ. Every change is
+one transaction, and a database has one writer at a time.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ RunEpisode = Callable[[int], EpisodeRecord]
 """Function that runs the episode with a given seed."""
 
 Prepare = Callable[[Setting, str], RunEpisode]
-"""Function that builds and warms up a setting's decoder for a task. Its method `together` runs batches."""
+"""Object that, when called, builds and warms up a setting's decoder for a task. Its method `together` runs batches."""
 
 Save = Callable[[EpisodeRecord, Path, str], object]
 """Function that writes an episode to a .rrd file. The last argument is the setting's label."""
@@ -147,7 +147,7 @@ def work_on(study: Study, run_id: str, on_event: OnEvent, save: Save) -> None:
 
     Args:
         study: The study.
-        run_id: Only blocks of the command with this id. Empty: all.
+        run_id: Only blocks of the command with this id. If empty, blocks of any command.
         on_event: Called with each event, to show progress.
         save: Writes the recording (.rrd file) of an episode.
 
@@ -195,8 +195,8 @@ def checked(setting: Setting, tasks: list[str], results: str) -> Setting:
 def work(queue: Queue, prepare: Prepare, on_event: OnEvent = lambda event: None) -> None:
     """Claim and run the blocks (groups of episodes) of a queue, one after another, until none is left.
 
-    If a setting fails, it is reported and the other settings go on. While other workers run all blocks that are left,
-    wait: if one of them dies, its block is free again.
+    If a setting fails, the failure is reported and the other settings go on. While other workers run all blocks that
+    are left, wait: if one of these workers dies, its block is free again.
 
     Args:
         queue: The blocks.
@@ -243,10 +243,10 @@ class Claim:
 
     Attributes:
         id: Row number of the block in the queue.
-        run: Id of the command that planned it.
+        run: Id of the command that planned the block.
         about: Executor and number of workers of that command.
         block: The episodes to run.
-        existing: Episodes of the block that others have run since the plan was made, with their rows.
+        existing: Episodes of the block that other workers have run since the plan was made, with their rows.
         killer: The episode in which two workers have died. None if there is no such episode.
     """
 
@@ -263,7 +263,7 @@ class Queue:
 
     Args:
         study: The study.
-        run: Only blocks that the command with this id has planned. Empty: all blocks of the study.
+        run: Only blocks that the command with this id has planned. If empty, all blocks of the study.
     """
 
     def __init__(self, study: Study, run: str = "") -> None:
@@ -300,7 +300,7 @@ class Queue:
         A block is not free while another worker runs one of its episodes, even for another study.
 
         Args:
-            ended: The block that this worker has just finished. It is removed from the queue. None: no such block.
+            ended: The block that this worker has just finished. It is removed from the queue. None if there is none.
         """
         with self.database.writing() as connection:
             if ended is not None:
@@ -322,7 +322,7 @@ class Queue:
         return self._claim_of(row, killer)
 
     def _first_free(self, connection: sa.Connection) -> Any:
-        """Return the first free row of which no other worker runs an episode. None if there is no such row."""
+        """Return the first free row whose episodes no other worker runs. None if there is no such row."""
         query = sa.select(QUEUE).where(self._mine(), self._is_open(connection))
         query = query.order_by(QUEUE.c.position, QUEUE.c.id)
         held: dict[str, set[tuple[Any, ...]]] = {}
@@ -338,7 +338,7 @@ class Queue:
     def _held_outside(self, connection: sa.Connection, run: str) -> set[tuple[Any, ...]]:
         """Return the keys of episodes that other workers run for commands other than `run`.
 
-        The blocks of one command share no episode, so its own episodes need no check.
+        The blocks of one command share no episode, so blocks that `run` planned need no check.
         """
         query = sa.select(QUEUE.c.episodes).join(STUDIES, STUDIES.c.id == QUEUE.c.study_id)
         query = query.where(QUEUE.c.run != run, QUEUE.c.worker != self.worker, ~_is_free(connection))
@@ -368,7 +368,7 @@ class Queue:
         return Claim(row.id, row.run, row.about, Block(tuple(missing)), existing, guilty)
 
     def _settings_of(self, row: Any) -> dict[str, Setting]:
-        """Return the settings of a row's episodes, by their hashes. They read this process's results folder.
+        """Return the settings of a row's episodes, by their hashes. Their `results` is this process's results folder.
 
         Raises:
             KervError: This version of kerv computes other results than the version that planned the block.
@@ -391,7 +391,7 @@ class Queue:
         Args:
             connection: The database, in a transaction.
             claim: The block.
-            running: The episode that begins now. None: the stored episode does not change.
+            running: The episode that begins now. If None, the stored episode does not change.
             **values: Further columns of the block's row to write.
 
         Raises:
@@ -410,7 +410,7 @@ class Queue:
 
     @contextlib.contextmanager
     def beating(self) -> Iterator[None]:
-        """Write the heartbeat of the claimed block during the `with` statement. At its end, free that block."""
+        """Write the heartbeat of the claimed block during the `with` block. At the end, free that block."""
         ended = threading.Event()
 
         def beat() -> None:
@@ -436,9 +436,9 @@ class Queue:
                     connection.execute(freed.values(worker=None, heartbeat=None, running=None))
 
     def left(self) -> tuple[int, int]:
-        """Return how many blocks have not ended, and how many of those no worker has claimed.
+        """Return how many blocks have not ended, and how many of these blocks no other live worker has claimed.
 
-        This only reads the database, so no worker has to wait for it.
+        This method only reads the database, so no worker has to wait for it.
         """
         with self.database.reading() as connection:
             is_open = sa.case((self._is_open(connection), 1), else_=0)
@@ -453,7 +453,11 @@ class Queue:
             return [(position, worker) for position, worker in connection.execute(query)]
 
     def lapse(self, pid: int) -> bool:
-        """Free at once the blocks that a dead process of this machine had claimed. Return whether there were any."""
+        """Free at once the blocks that a dead process of this machine had claimed. Return whether it had claimed any.
+
+        Args:
+            pid: Id of the process.
+        """
         with self.database.writing() as connection:
             died = QUEUE.c.worker.startswith(worker_id(pid), autoescape=True)
             return bool(connection.execute(sa.update(QUEUE).where(died).values(heartbeat=0.0)).rowcount)
@@ -473,7 +477,7 @@ def worker_id(pid: int, more: str = "") -> str:
 
     Args:
         pid: Id of the process.
-        more: Differs between the workers of one process. Empty: return the prefix that their names share.
+        more: Differs between the workers of one process. If empty, return the prefix that their names share.
     """
     return f"{socket.gethostname()}:{pid}:{more}"
 
@@ -522,10 +526,10 @@ class _Attempt:
     failed: list[Episode] = field(default_factory=list)
 
     def run(self) -> bool:
-        """Run the block. Episodes that others have run meanwhile are linked to the study instead.
+        """Run the block. Episodes that other workers have run meanwhile are linked to the study instead.
 
         Returns:
-            Whether it has ended. If not, the claim was lost.
+            Whether the block has ended. If not, the claim was lost.
         """
         block = self.claim.block
         self.left = list(block.turns())
@@ -664,7 +668,7 @@ class _Attempt:
 
 
 def failure_of(error: BaseException) -> SettingFailed:
-    """Describe an error in one line. For errors that are not KervErrors, add the type, file and line."""
+    """Return a SettingFailed with the error in one line. For other errors than KervErrors, add type, file and line."""
     trace = "".join(traceback.format_exception(error))
     text = " ".join(str(error).split())
     if isinstance(error, KervError):

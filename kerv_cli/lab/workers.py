@@ -47,7 +47,7 @@ def worker_command(queue: Queue, threads: int, **settings: str) -> tuple[list[st
     """Return the command line and the environment variables that start a worker for a queue's study.
 
     Args:
-        queue: The blocks.
+        queue: The queue, which names the study and the database.
         threads: Number of CPU threads.
         **settings: Further settings of `kerv work`.
     """
@@ -58,7 +58,7 @@ def worker_command(queue: Queue, threads: int, **settings: str) -> tuple[list[st
 
 
 def last_line(text: str) -> str:
-    """Return the last line of a text that is not blank. Empty if there is none."""
+    """Return the last line of `text` that is not blank. Empty if every line is blank."""
     return text.strip().rpartition("\n")[2].strip()
 
 
@@ -68,7 +68,7 @@ def gpus_in_turn(device: str) -> list[str]:
     If the list is empty, the workers see the same GPUs as this process.
 
     Args:
-        device: Device of the settings. If the GPU has a number, as in `cuda:1`, all workers use that GPU.
+        device: Device of the settings. If it is no GPU, or a GPU with a number as in `cuda:1`, the list is empty.
     """
     if device != "cuda":
         return []
@@ -108,7 +108,7 @@ class _Worker:
 
 
 class LocalWorkers:
-    """Processes of `kerv work`. Use it in a `with` statement, which ends them.
+    """Processes of `kerv work`. Use it in a `with` statement, which starts and ends them.
 
     Each worker reads from a pipe that nobody writes to. When this process ends, even if it is killed, the pipe is
     closed, and the workers end.
@@ -117,7 +117,7 @@ class LocalWorkers:
         queue: The blocks that the workers run.
         number: Number of workers.
         threads: Number of CPU threads per worker.
-        gpus: Values of CUDA_VISIBLE_DEVICES, which the workers get in turn. Empty: the variable stays as it is.
+        gpus: Values of CUDA_VISIBLE_DEVICES, which the workers get in turn. If empty, the variable stays as it is.
     """
 
     def __init__(self, queue: Queue, number: int, threads: int, gpus: Sequence[str] = ()) -> None:
@@ -155,7 +155,8 @@ class LocalWorkers:
         """Replace workers that were killed.
 
         Raises:
-            KervError: A worker has ended with an error, or several in a row were killed before they claimed a block.
+            KervError: A worker has ended with an error, or MOST_STILLBORN in a row were killed before they claimed a
+                block.
         """
         for at, worker in enumerate(self._workers):
             code = worker.process.poll()
@@ -177,7 +178,7 @@ def _ask(program: str, *words: str, text: str = "", environment: dict[str, str] 
     """Run a program of Slurm, and return what it prints.
 
     Raises:
-        UsageError: There is no such program, or it refuses.
+        UsageError: There is no such program, it does not answer within 60 s, or it refuses.
     """
     try:
         run = subprocess.run(
@@ -194,17 +195,18 @@ def _ask(program: str, *words: str, text: str = "", environment: dict[str, str] 
 
 
 class Array:
-    """The workers of a study on a cluster: an array of Slurm jobs. Ctrl-C in its `with` statement cancels them.
+    """The workers of a study on a cluster: an array of Slurm jobs. Ctrl-C in the `with` statement cancels the jobs.
 
     An array from an earlier sweep of the study is used if it still waits or runs. Otherwise a new one is submitted.
 
     Args:
         queue: The blocks.
-        runtime: Number of workers, and the resources that each needs.
+        runtime: Number of workers, and the resources that each worker needs.
         threads: Number of CPU threads per worker.
 
     Raises:
         UsageError: This machine has no Slurm, or Slurm refuses the job.
+        StorageError: The folder of the workers' logs cannot be made.
     """
 
     def __init__(self, queue: Queue, runtime: RuntimeSettings, threads: int) -> None:
@@ -224,7 +226,7 @@ class Array:
                 _ask("scancel", self.id)
 
     def _running(self) -> str:
-        """Return the id of the study's array that waits or runs. Empty if there is none."""
+        """Return the id of this study's array if it waits or runs. Empty if there is no such array."""
         found = _ask("squeue", "--noheader", "--me", f"--name={self.name}", "--format=%F").split()
         return found[0] if found else ""
 
@@ -251,13 +253,13 @@ class Array:
         return printed.strip().partition(";")[0]
 
     def tend(self, ended: int) -> None:
-        """Submit another array if all jobs have ended, for example at their time limit, but some episodes are left.
+        """Submit another array if all jobs have ended but some episodes are left, for example at a time limit.
 
         Args:
             ended: Number of episodes and settings that have ended or failed so far.
 
         Raises:
-            KervError: The jobs have ended without a single episode.
+            KervError: All jobs of an array from this method have ended, and no episode or setting ended meanwhile.
         """
         if time.monotonic() - self._asked < _LOOK_SECONDS:
             return
@@ -269,6 +271,6 @@ class Array:
         self.id, self._ended = self._submitted(), ended
 
     def _last_line(self) -> str:
-        """Return the last line of the newest log, or where the logs are."""
+        """Return the last line of the newest log. If there is none, return a text that says where the logs are."""
         logs: list[Path] = sorted(visible(self.logs), key=lambda path: path.stat().st_mtime)
         return (logs and last_line(logs[-1].read_text(errors="replace"))) or f"see {self.logs}"
