@@ -45,7 +45,7 @@ class Command(Part):
         keys: Names of the settings that `--help` lists, separated by spaces.
         typed: Maps a key as typed on the command line to the name of the setting, if the two differ.
         writes: Whether the command writes to the results folder. If so, kerv first checks that the folder is writable.
-        each: Name of another command, whose settings can be typed, too, such as `rollout` for `sweep`.
+        each: Name of another command whose settings can also be typed after this command. For `sweep` it is `rollout`.
     """
 
     kind = "command"
@@ -106,12 +106,12 @@ def top_keys(part: Command) -> list[str]:
 
 
 def commands(words: str = "") -> dict[str, Command]:
-    """Return the commands that begin with some words, by name, in the order of the help.
+    """Return the commands whose names begin with `words`, by name, in the order of the help.
 
-    Only the file that declares them is imported, so that help and error messages appear quickly.
+    Only the file that declares these commands is imported, so that help and error messages appear quickly.
 
     Args:
-        words: Words, such as `train`. Empty: all commands.
+        words: First words of the names, such as `train`. If empty, all commands are returned.
     """
     files, file = MODULES["command"], f"kerv_cli.cli.{words.partition(' ')[0]}"
     found = parts("command", file if file in files else "")
@@ -147,7 +147,7 @@ def _with_settings(cfg: Cfg = False) -> None:
 
 
 def _values(part: Command, key: str) -> list[str]:
-    """Return the names that a setting can have as its value. Empty if its values are not names from a list."""
+    """Return the values that the setting `key` allows. Empty if its values are not names from a list."""
     if key == "task":
         from kerv_cli.worlds import task_names
 

@@ -90,7 +90,7 @@ def end_with_plan(text: str, as_json: bool = False) -> NoReturn:
 
     Args:
         text: The plan.
-        as_json: Print the plan as JSON.
+        as_json: Whether to print the plan as JSON.
     """
     if as_json:
         end_with_json({"plan": text})
@@ -148,7 +148,7 @@ def _is_of_an_interrupt(error: BaseException | None) -> bool:
 
 
 def _parse_error(error: Any, words: Sequence[str]) -> str:
-    """Return the text for typer's parse error. For an unknown option it adds how to write a setting.
+    """Return the text for typer's parse error. For an unknown option the text also says how to write a setting.
 
     Args:
         error: Typer's exception.
@@ -185,10 +185,12 @@ def _refuse(message: str, code: int, error: BaseException | None, words: Sequenc
 
 
 def with_results(message: str, words: Iterable[str]) -> str:
-    """Append the `results=` and `store=` that the user typed to every quoted command in a message that lacks them.
+    """Add `results=` and `store=`, as the user typed them, to the commands of kerv that a message quotes.
+
+    A command that has `results=` already, or that has no such setting, is not changed.
 
     Args:
-        message: The message, with commands as in `'kerv calibrate task=reach'`.
+        message: The message. Commands are in quotes, as in `'kerv calibrate task=reach'`.
         words: Command-line arguments after `kerv`.
     """
     from kerv_cli.base.registry import parts
@@ -219,12 +221,12 @@ def database_of(settings: CommandSettings) -> Database:
 def as_planned(
     settings: CommandSettings, plan: bool = False, as_json: bool = False
 ) -> Iterator[tuple[Database, Begin]]:
-    """Open a `with` block in which an artifact is made. At the end of the block, store in the database how it ended.
+    """Open a `with` block that makes an artifact. At the end, store in the database how the command ended.
 
     Args:
         settings: Settings of the command.
-        plan: Print what would be made, and how long it takes, and end the command.
-        as_json: Print the plan as JSON.
+        plan: Whether to print only what would be made and how long that takes, and then end the command.
+        as_json: Whether to print the plan as JSON.
 
     Yields:
         The database of the results folder, and a function that the code in the block calls once the settings are
@@ -253,7 +255,7 @@ def progress_bar(title: str, record: Run | None = None, has_estimate: bool = Fal
 
     Args:
         title: Text before the bar.
-        record: The command's row in the database. The progress is also written to it. None: the command has no row.
+        record: The command's row in the database, to which the progress is also written. None if there is no row.
         has_estimate: Whether the text says how much time is left. If not, the bar estimates and shows it.
 
     Yields:
@@ -287,7 +289,7 @@ def progress_bar(title: str, record: Run | None = None, has_estimate: bool = Fal
 
 
 def console(stderr: bool = False) -> Console:
-    """Return a rich console on standard output or standard error. If that is no terminal, it is 200 columns wide."""
+    """Return a rich console on standard output or standard error. Without a terminal, the console has 200 columns."""
     from rich.console import Console
 
     wide = None if (sys.stderr if stderr else sys.stdout).isatty() else 200
@@ -317,7 +319,7 @@ def _cell(value: object) -> str:
 
 
 def print_rows(rows: Sequence[Mapping[str, object]], title: str | None = None) -> None:
-    """Print a table of rows with the same keys, which are the columns."""
+    """Print a table of rows. All rows have the same keys, which become the names of the columns."""
     print_table(rows[0], (row.values() for row in rows), title)
 
 
@@ -328,7 +330,7 @@ def print_figures(what: str, figures: Mapping[str, float], folder: object, as_js
         what: Header of the table.
         figures: The numbers by name.
         folder: Folder of the artifact that the numbers describe.
-        as_json: Print numbers and folder as JSON.
+        as_json: Whether to print the numbers and the folder as JSON.
     """
     if as_json:
         end_with_json({"folder": folder, **figures})

@@ -107,7 +107,7 @@ def _two(names: list[str], what: str) -> tuple[list[str], Mapping[str, Fraction]
 
     Args:
         names: The arguments.
-        what: What the two are, for the error message.
+        what: What the user must name, such as `success counts`, for the error message.
 
     Raises:
         UsageError: There are not exactly two counts or rates, or a number cannot be read.

@@ -173,7 +173,7 @@ def _disk(settings: DoctorSettings) -> str:
 
 
 def _database(settings: DoctorSettings) -> str:
-    """Return which database is used, as text. Raises KervError if it does not answer."""
+    """Return which database is used, as text. Raises KervError if the database does not answer."""
     from kerv_cli.lab.runs import run_rows
 
     database = database_of(settings)

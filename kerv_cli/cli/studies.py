@@ -83,7 +83,7 @@ def _few(names: Sequence[str], what: str) -> str:
 
     Args:
         names: The names.
-        what: What they name, in plural.
+        what: What the names are, in plural, such as `tasks`.
     """
     return ", ".join(names) if len(names) < 4 else f"{len(names)} {what}"
 
@@ -100,8 +100,8 @@ def print_study_plan(planned: Study, as_json: bool, guess: float = SECONDS_PER_E
 
     Args:
         planned: The plan.
-        as_json: Print the plan as JSON.
-        guess: Seconds per episode if none was measured.
+        as_json: Whether to print the plan as JSON.
+        guess: Seconds per episode, used if no episode was measured.
     """
     from kerv_cli.lab.study import TimeLeft
     from kerv_cli.lab.workers import disturbances
@@ -145,7 +145,7 @@ def run_study(planned: Study, guess: float = SECONDS_PER_EPISODE) -> Outcome:
 
     Args:
         planned: The plan.
-        guess: Seconds per episode while none is measured.
+        guess: Seconds per episode, used while no episode is measured.
 
     Raises:
         Interrupted: The user pressed Ctrl-C.
@@ -165,7 +165,7 @@ def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None =
 
     Args:
         show: Moves the bar, see `progress_bar`.
-        left: Estimates the time left. None: it is not shown.
+        left: Estimates the time left. If None, no time is shown.
     """
     from kerv_cli.lab.work import BlockStarted, BlocksWait, Preparing, SettingFailed, Started
 
@@ -219,14 +219,14 @@ def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None =
 def print_study(data: StudyData, all_columns: bool = False, how: str = "", explain: bool = False) -> None:
     """Print the table of a study and its note.
 
-    A setting has no speedup if its episodes were not timed alternately with the baseline's. Name these settings, and
-    the command that times them again.
+    A setting has no speedup if its episodes were not timed alternately with the baseline's. The output names such
+    settings, and the command that times them again.
 
     Args:
         data: The study.
-        all_columns: Print all columns, not only those that people need first.
-        how: What to type to see all columns. Empty: `kerv report study=NAME --all`.
-        explain: Say in a few words what each setting is.
+        all_columns: Whether to print all columns, not only the most important ones.
+        how: What to type to see all columns. If empty, `kerv report study=NAME --all`.
+        explain: Whether to say in a few words what each setting is.
     """
     from kerv_cli.report.summary import SummaryTable, explanations, not_in_turn
     from kerv_cli.report.tables import split_values
