@@ -220,6 +220,7 @@ DEVICE = torch.device("meta")  # any device but the CPU
     [
         (Draft.of(range(4)), "drafted 4 tokens on a path: at most 3"),
         (HOST_TREE, "drafted 4 tokens on a path: at most 3"),
+        (Draft.of([1, 2], [1, -1]), "node 0 has parent 1: parents come before their children"),
         (Draft(torch.zeros(4, dtype=torch.long, device=DEVICE)), "drafted 4 tokens on a path: at most 3"),
         (Draft(*torch.zeros(2, 4, dtype=torch.long, device=DEVICE), levels=4), "drafted 4 tokens on a path: at most 3"),
         (Draft(*torch.zeros(2, 4, dtype=torch.long, device=DEVICE)), "without Draft.levels"),

@@ -62,9 +62,8 @@ class Draft:
             depth: Maximum number of tokens on a path.
 
         Raises:
-            KervError: A token is out of range, a path is too long, a tree on the GPU has no `levels`, or tokens and
-                parents are on different devices.
-            ValueError: A parent on the CPU does not come before its child.
+            KervError: A token is out of range, a path is too long, a parent does not come before its child, a tree on
+                the GPU has no `levels`, or tokens and parents are on different devices.
         """
         device, reached = self.tokens.device, len(self)
         if device == HOST:
@@ -75,7 +74,10 @@ class Draft:
                     f"the proposer '{proposer}' drafted tokens on {device} and parents on {self.parents.device}: put "
                     "both on one device"
                 )
-            reached = max(self.tree.depths, default=-1) + 1 if device == HOST else self.levels
+            try:
+                reached = max(self.tree.depths, default=-1) + 1 if device == HOST else self.levels
+            except ValueError as error:
+                raise KervError(f"the proposer '{proposer}' drafted a tree that is none: {error}") from error
             if len(self) and not reached:
                 raise KervError(f"the proposer '{proposer}' drafted a tree on {device} without Draft.levels")
         if reached > depth:
