@@ -1,6 +1,6 @@
 """Codes of whole chunks: sequences of tokens that stand for all actions of a chunk together (docs/methods.md §0.3).
 
-Notation: D degrees of freedom (DoFs), H control steps of a chunk, V tokens of the vocabulary.
+Notation: D degrees of freedom (DoFs) of an action, H control steps of a chunk, V different tokens.
 """
 
 from __future__ import annotations
@@ -15,33 +15,33 @@ from typing import Any
 import numpy as np
 
 SCALE = 10.0
-"""Factor by which coefficients are multiplied before rounding (FAST §4.3)."""
+"""Factor by which the cosine coefficients are multiplied before they are rounded (FAST §4.3)."""
 VOCABULARY = 256
-"""Number of tokens. FAST has 1,024, for longer chunks of more DoFs."""
+"""Number of tokens of a learnt code, the end token included. FAST has 1,024, for longer chunks with more DoFs."""
 FIRST = 0x4E00
-"""Code point of the character that stands for token 0 while merges are learnt or applied."""
+"""Unicode code point of the character for token 0. To learn or apply merges, each coefficient becomes a character."""
 
 
 @dataclass(frozen=True)
 class FastCode:
     """FAST: byte-pair merges of quantised cosine coefficients (Pertsch et al. 2025, arXiv 2501.09747, §4).
 
-    The cosine transform along time turns a chunk of normalised actions into H coefficients per DoF. They are scaled,
-    rounded, and ordered by frequency, all DoFs of the lowest frequency first. A merge replaces a frequent pair of
-    neighbouring tokens by one new token.
+    The cosine transform along time turns a chunk of normalised actions into H coefficients per DoF. The coefficients
+    are scaled, rounded, and ordered by frequency, all DoFs of the lowest frequency first. A merge replaces a frequent
+    pair of neighbouring tokens by one new token.
 
-    Ours: zeros at the end are dropped. An end token takes their place. So each beginning of a sequence stands for a
-    complete, coarser motion, and sequences differ in length.
+    Unlike FAST, kerv drops the zeros at the end of a sequence, and puts an end token in their place. So sequences
+    differ in length, and the first tokens of a sequence alone stand for a complete, coarser motion.
 
     Args:
         steps: H, control steps of a chunk.
         dofs: D, degrees of freedom of an action.
-        scale: Factor of the coefficients before rounding.
+        scale: Factor by which the coefficients are multiplied before they are rounded.
         merges: For each merged token, the two tokens that it joins. Tokens 0, 1, … are the rounded coefficients from
             the lowest to the highest. The merged tokens follow, then the end token.
 
     Raises:
-        ValueError: A merge names a token that comes after it.
+        ValueError: A merge joins a token that does not come before the merged token.
     """
 
     steps: int
@@ -56,7 +56,7 @@ class FastCode:
 
     @classmethod
     def learn(cls, chunks: np.ndarray) -> FastCode:
-        """Learn the merges from chunks (n, H, D) of normalised actions."""
+        """Return a code for chunks of this shape, with merges learnt from n chunks (n, H, D) of normalised actions."""
         from tokenizers import Tokenizer, models, trainers
 
         plain, merges = cls(chunks.shape[1], chunks.shape[2], SCALE), []
@@ -100,7 +100,7 @@ class FastCode:
 
     @property
     def spellings(self) -> list[str]:
-        """For each token except the end token, its text: a character per rounded coefficient."""
+        """The text of each token except the end token: a character per rounded coefficient that it stands for."""
         texts = list(map(chr, range(FIRST, FIRST + 2 * self.highest + 1)))
         for first, second in self.merges:
             texts.append(texts[first] + texts[second])
@@ -122,7 +122,7 @@ class FastCode:
         return np.rint(dct(chunks, axis=1, norm="ortho") * self.scale).astype(np.int64).reshape(len(chunks), -1)
 
     def motions(self, coefficients: np.ndarray) -> np.ndarray:
-        """Return the motions (n, H, D) of coefficients (n, H · D): normalised actions that are not clipped yet."""
+        """Return the normalised actions (n, H, D) of coefficients (n, H · D). They are not clipped to [−1, 1]."""
         from scipy.fft import idct
 
         return idct(coefficients.reshape(-1, self.steps, self.dofs) / self.scale, axis=1, norm="ortho")
@@ -159,5 +159,5 @@ class FastCode:
 
 
 CODES: dict[str, Callable[[np.ndarray], FastCode | None]] = {"bins": lambda chunks: None, "fast": FastCode.learn}
-"""For each code of actions, a function of chunks (n, H, D) of normalised actions that makes it. With `bins`, every
-number of an action is a token of its own, and there is nothing to learn."""
+"""For each name of a code, the function that learns the code from chunks (n, H, D) of normalised actions. The function
+of `bins` returns None, because every number of an action is then a token of its own."""

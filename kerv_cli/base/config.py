@@ -1,8 +1,8 @@
 """Compose the settings of a command from `conf/`, method or study files, and overrides. Only this module uses Hydra.
 
 A file of conf/ is a mapping from keys to values. Overrides are `key=value` arguments in Hydra's grammar. They are
-checked before torch or MuJoCo load. An error message is one line. It names the file and the line of a mistake in a
-file.
+checked before torch or MuJoCo load. An error message is one line. If the mistake is in a file, the message names the
+file and the line.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from kerv_cli.base.settings import choices_of
 T = TypeVar("T")
 
 PRESETS = ("method", "study")
-"""Groups of conf/ whose files set several settings at once. Such a file is chosen by its name or by its path."""
+"""Groups (folders) of conf/ whose files set several settings at once. A file is chosen by its name or its path."""
 WHOLE = ("drafter",)
-"""Groups whose files set keys of the whole command, not only of the group."""
+"""Groups whose files can set every key of a command, such as `train.lr`. Other files set only keys of their group."""
 MOST_POINTS = 10_000
 """Maximum number of combinations in a grid of settings."""
 
@@ -41,7 +41,7 @@ def conf_dir() -> Path:
     This is `$KERV_CONF_DIR` if it is set, else `conf/` of the checkout, else `conf/` inside the installed package.
 
     Raises:
-        UsageError: The folder has no configuration.
+        UsageError: There is no such folder, or it has no configuration.
     """
     folder = os.environ.get("KERV_CONF_DIR")
     package = Path(__file__).resolve().parents[1]
@@ -53,10 +53,9 @@ def conf_dir() -> Path:
 
 
 def command_of_a_study(word: str) -> str | None:
-    """Return the first command that contains the setting `word`, from the lists `first` of the study files.
+    """Return the first command in the study files that contains the setting `word`, or None if no command does.
 
-    Each list holds the commands that make what its study needs, such as targets and drafters. Returns None if no
-    command contains the setting.
+    The list `first` of a study file holds the commands that make what the study needs, such as targets and drafters.
 
     Args:
         word: A setting with its value, such as `name=mt10-h1-150m` or `policy.artifacts.drafter=mt10-h1-few`.
@@ -94,7 +93,7 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     Args:
         command: The command's name, with `_` instead of a space.
         overrides: Arguments as typed: `method=kerv`, `threshold.r=5`, `task=[reach,push]`. Each key at most once.
-            `quick=true` adds the command's settings in `conf/quick.yaml`, as if they were typed before all others.
+            `quick=true` adds the command's settings in `conf/quick.yaml`. Typed settings take precedence over these.
         schema: Dataclass of the settings. Its defaults apply to settings that neither a file nor an override sets.
 
     Raises:
@@ -144,10 +143,10 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
 
 
 def _typed(overrides: Sequence[str], schema: type) -> dict[str, Any]:
-    """Parse overrides into a map from key to value. A list needs no brackets: `task=a,b`.
+    """Parse overrides into a map from key to value. A setting that is a list needs no brackets: `task=a,b`.
 
     Raises:
-        UsageError: A key is given twice, a single value is needed but several are given, or no task is named.
+        UsageError: A key is given twice, a setting with a single value is given several, or `task=` is empty.
     """
     lists = {at.name for at in fields(schema) if str(at.type).startswith("list[")}
     typed: dict[str, Any] = {}
@@ -185,7 +184,7 @@ def preset_file(group: str, name: str) -> Path:
 
 
 def _read_preset(group: str, name: str) -> tuple[dict[str, str], list[tuple[str, Any]], dict[str, str]]:
-    """Read a method or study file: a mapping from keys to values, as they could be typed.
+    """Read a method or study file. The file maps keys to values, which overrides could set, too.
 
     In a method file, `proposer: drafter` chooses a part. All other keys set values, as in `threshold.r: 5`.
 
@@ -194,8 +193,8 @@ def _read_preset(group: str, name: str) -> tuple[dict[str, str], list[tuple[str,
         name: As for `preset_file`.
 
     Returns:
-        Three values: the part that the file chooses in each group, the (key, value) pairs that the file sets, and where
-        it sets each key, as `FILE:LINE: ` for error messages.
+        Three values. A map from each group to the part that the file chooses in it. The (key, value) pairs that the
+        file sets. A map from each key to its line in the file, written as `FILE:LINE: ` for error messages.
 
     Raises:
         UsageError: The file is missing, is not YAML, or chooses a part in the wrong form.
@@ -220,7 +219,7 @@ def _check(settings: Any) -> None:
     """Check that every setting is in its range and every chosen part is registered.
 
     Raises:
-        UsageError: A setting is out of range, a part is not registered, or its `kind` alone was set.
+        UsageError: A setting is out of range, a part is not registered, or GROUP.kind was set instead of GROUP.
     """
     check_settings(settings)
     for group in SETTINGS_GROUPS:
@@ -255,7 +254,7 @@ def _parsed(override: str) -> Any:
 
 @functools.lru_cache(maxsize=256)
 def _composed(choices: tuple[tuple[str, str], ...], schema: type, conf: Path, artifacts: tuple[str, ...]) -> bytes:
-    """Return the settings of a command with these choices: a node of OmegaConf, pickled.
+    """Return the settings of a command with these choices, as a pickled OmegaConf node.
 
     Unpickling the settings takes a fifth of the time of a deep copy.
 
@@ -284,9 +283,9 @@ def _composed(choices: tuple[tuple[str, str], ...], schema: type, conf: Path, ar
 
 
 def _choice(group: str, name: str) -> tuple[Part | None, list[tuple[str, Any]]]:
-    """Return the part that a name chooses in a group, if it chooses one, and the (key, value) pairs that its file sets.
+    """Return the part that `name` chooses in `group` (or None), and the (key, value) pairs that the name's file sets.
 
-    A file `conf/<group>/<name>.yaml` may continue another choice of its group, which it names with the key `base`.
+    A file `conf/<group>/<name>.yaml` may extend another choice of its group. The file's key `base` names that choice.
     """
     parts_of_group = _parts_of(group) if group in SETTINGS_GROUPS else {}
     path = conf_dir() / group / f"{name}.yaml"
@@ -314,7 +313,7 @@ def _open_mappings(node: Any) -> None:
 
 
 def _field(node: Any, key: str) -> Field[Any] | None:
-    """Return the field of the settings dataclass that declares a setting. None if no dataclass does."""
+    """Return the dataclass field that declares the setting `key`. None if no dataclass declares it."""
     from omegaconf import OmegaConf
 
     above, _, name = key.rpartition(".")
@@ -367,12 +366,12 @@ def split(text: str) -> list[str]:
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:
-    """Combine all values of the overrides, and return each combination as a list of overrides with one value.
+    """Combine all values of the overrides. Return each combination as a list of overrides with one value each.
 
-    For example, `threshold.r=0,3` gives two lists. The values are written in Hydra's syntax, also as `range(0,4)`.
+    For example, `threshold.r=0,3` gives two lists. Hydra's other syntax for values works, too, such as `range(0,4)`.
 
     Raises:
-        UsageError: An override cannot be parsed, there is no combination, or there are more than MOST_POINTS.
+        UsageError: An override cannot be parsed, or there are no combinations, or more than MOST_POINTS.
     """
     from hydra.errors import HydraException
 

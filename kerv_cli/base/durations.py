@@ -13,8 +13,8 @@ def left(seconds: float, done: float, total: float) -> str:
 
     Args:
         seconds: Time that the work took so far.
-        done: Units of work that are finished.
-        total: All units of work.
+        done: Number of finished units of work, above 0.
+        total: Number of all units of work.
     """
     return f"about {duration(seconds * (total / done - 1))} left"
 

@@ -49,7 +49,7 @@ _LISTED = 24  # names that a message lists
 
 
 class UnknownName(UsageError):
-    """A name does not exist. The message suggests similar names, or lists the known ones.
+    """A name does not exist. The message suggests similar names, or lists known names (24 at most).
 
     Args:
         kind: Kind of thing that is named, such as `task`, for the message.
@@ -78,7 +78,7 @@ class Interrupted(KervError):
 
 
 class RenderingUnavailable(KervError):
-    """No OpenGL backend can draw a frame here."""
+    """No OpenGL backend of this machine can draw a frame."""
 
 
 class CheckpointError(KervError):

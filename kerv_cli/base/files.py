@@ -1,6 +1,7 @@
 """Write files and folders atomically (complete or not at all); read text, JSON and YAML; compute hashes.
 
-A temporary name is hidden and names the machine and the process: `.<name>.<host>.<process id>-<8 digits>.tmp`.
+Files and folders have a temporary name until they are complete. This name begins with a dot and contains the machine
+and the process: `.<name>.<host>.<process id>-<8 hex digits>.tmp`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ MOST_TEXT = 2**28
 MOST_YAML = 2**18
 """Maximum size of a YAML file in bytes. Reading one takes ten seconds per megabyte."""
 MOST_VALUES = 20_000
-"""Maximum number of keys and values in a YAML file, with the ones that its aliases repeat."""
+"""Maximum number of values in a YAML file, nested values included. A value that an alias repeats counts again."""
 MOST_BYTES = 2**36
 """Maximum size of a file of weights or of a table in bytes."""
 
@@ -61,9 +62,9 @@ def storage_errors(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _temporary(path: Path) -> Iterator[Path]:
-    """Yield a new temporary path beside `path`, which the `with` block fills and then renames to `path`.
+    """Yield a new temporary path beside `path`. The `with` block writes there, and then renames the result to `path`.
 
-    The parent folder is created. What is still at the temporary path after the block is removed.
+    The parent folder is created. After the block, anything left at the temporary path is removed.
     """
     temporary = temporary_beside(path)
     try:
@@ -117,9 +118,9 @@ def write_folder(folder: Path, fill: Callable[[Path], object]) -> None:
 
 
 def set_aside(folder: Path) -> Path:
-    """Give a folder a temporary name in one step, so that every command ignores it, and return its new path.
+    """Rename a folder in one step, so that every command ignores it. Return the new, temporary path.
 
-    A later command removes it if this process is killed.
+    If this process is killed before it deletes the folder, a later command does. A missing folder is no error.
 
     Raises:
         StorageError: The disk is full or read-only, or permission is missing.
@@ -133,7 +134,7 @@ def set_aside(folder: Path) -> Path:
 
 
 def _exchange(a: Path, b: Path) -> None:
-    """Replace folder `b` by folder `a`, in one step if the file system can do so. Else remove `b` first."""
+    """Replace folder `b` by folder `a`. If the file system can, exchange both in one step. Else remove `b` first."""
     libc = ctypes.CDLL(None, use_errno=True)
     if hasattr(libc, "renameat2"):
         here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
@@ -171,7 +172,9 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def write_if_changed(path: Path, content: bytes) -> None:
-    """Write a file atomically, unless it has this content already. So its modification time says when it changed.
+    """Write a file atomically, unless it has this content already.
+
+    So the file's modification time says when its content changed.
 
     Raises:
         StorageError: The disk is full or read-only, or permission is missing.
@@ -181,12 +184,12 @@ def write_if_changed(path: Path, content: bytes) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write text in UTF-8 atomically; raises as `write_bytes`."""
+    """Write text as UTF-8 atomically. The errors are the same as for `write_bytes`."""
     write_bytes(path, text.encode())
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a value as indented JSON atomically; raises as `write_bytes`.
+    """Write a value as indented JSON atomically. It raises the errors of `write_bytes`, too.
 
     Raises:
         ValueError: The value contains NaN or infinity, which JSON cannot express.
@@ -242,7 +245,7 @@ def read_json(path: Path) -> Any:
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
-    """Return the JSON object (a mapping) in a file; raises as `read_json`.
+    """Return the JSON object (a mapping) in a file. It raises the errors of `read_json`, too.
 
     Raises:
         CheckpointError: The JSON value is not an object.
@@ -356,11 +359,11 @@ def clean(folder: Path) -> list[Path]:
 
 
 _clean_once = functools.cache(clean)
-"""Clean a folder. Later calls of this process do nothing."""
+"""`clean`, once per folder and process. Later calls with the same folder do nothing."""
 
 
 def remove(path: Path) -> None:
-    """Remove a file, or a folder with its content. If this fails, a later command tries again, without an error."""
+    """Remove a file, or a folder with its content. A failure raises no error, because a later command tries again."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:
@@ -369,10 +372,10 @@ def remove(path: Path) -> None:
 
 
 def is_alive(pid: int, seen: float) -> bool:
-    """Return whether a process of this machine that was alive at the time `seen` is still alive.
+    """Return whether a process of this machine is still alive. It was alive at the time `seen`.
 
-    A process that has the same id but began later does not count. Only Linux tells when a process began. On any other
-    system every process with this id counts.
+    A later process with the same id does not count. But only Linux tells when a process began. On other systems, any
+    process with this id counts.
 
     Args:
         pid: Id of the process.

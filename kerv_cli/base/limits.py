@@ -20,8 +20,9 @@ def setting(default: Any, help: str = "", **metadata: Any) -> Any:
     Args:
         default: The default value, or a function (such as a dataclass) that makes it.
         help: Description for `--help` and `--cfg`, one line.
-        **metadata: Further facts about the field. `limits`: the allowed range, as the function `limits` returns it.
-            `names`: the allowed values. `group`: the default file, for a field that is named like a folder of conf/.
+        **metadata: Further facts about the field. `limits` is the allowed range (least, most, above), see the function
+            `limits`. `names` are the allowed values. `group` is the file or part that is chosen by default, for a field
+            that is named like a folder of conf/.
     """
     metadata |= {"help": help} if help else {}
     if callable(default):
@@ -32,9 +33,9 @@ def setting(default: Any, help: str = "", **metadata: Any) -> Any:
 
 
 def limits(least: float = -math.inf, most: float = math.inf, above: float = -math.inf) -> dict[str, Any]:
-    """Return metadata that limit the value of a field: a number, or every number in a list or mapping.
+    """Return metadata that limit a field's number, or every number in a field's list or mapping.
 
-    None is always allowed, NaN never.
+    None is always allowed. NaN is never allowed.
 
     Args:
         least: The smallest allowed value.
@@ -75,10 +76,10 @@ def range_of(at: Field[Any]) -> str:
 
 
 def check_label(label: str) -> str:
-    """Check the label of one of a study's settings, and return it.
+    """Check the label (the name) of a setting in a study, and return the label.
 
     Raises:
-        UsageError: The label is empty, too long, or not one printable line.
+        UsageError: The label is empty, longer than 1,000 characters, or not one printable line.
     """
     if not 0 < len(label) <= 1000 or not label.isprintable():
         raise UsageError(f"'{' '.join(label[:80].split())}' names no setting: write one line of text")

@@ -36,7 +36,8 @@ def read(kind: type[T], value: Any, what: str, tolerant: bool = False) -> T:
             an error.
 
     Raises:
-        CheckpointError: A field is missing, unknown or of a wrong type. The message names the first such field.
+        CheckpointError: A field is missing, unknown, of a wrong type or out of range. The message names the first such
+            field.
     """
     from pydantic import ValidationError
 
@@ -57,13 +58,13 @@ def read_file(kind: type[T], path: Path) -> T:
     """Read a JSON file into a dataclass. Unknown fields are ignored.
 
     Raises:
-        CheckpointError: The file is missing or not JSON, or a field is missing or of a wrong type.
+        CheckpointError: The file is missing or not JSON, or a field is missing, of a wrong type or out of range.
     """
     return read(kind, read_mapping(path), str(path), tolerant=True)
 
 
 def content_of(key: Sequence[str], chunk: int, target: str, files: Mapping[str, str]) -> str:
-    """Return a hash of the four arguments, which together determine what a datastore finds (docs/formats.md).
+    """Return the hexadecimal SHA-256 of the four arguments. They determine what a datastore finds (docs/formats.md).
 
     Args:
         key: Parts of the prompt that form the search keys.
@@ -76,7 +77,7 @@ def content_of(key: Sequence[str], chunk: int, target: str, files: Mapping[str, 
 
 
 def check_files(folder: Path, files: Mapping[str, str], again: str) -> None:
-    """Check that the files in a folder have the hashes that its manifest names.
+    """Check that the files in a folder have the hashes that the folder's manifest names.
 
     Args:
         folder: The folder.

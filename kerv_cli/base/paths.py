@@ -17,7 +17,7 @@ RELEASED = ("libero-state", "mt10-state", "mt10-vision", "mt10-vision-parallel",
 """Names of the shipped policies. A checkout contains all of them, the wheel only `mt10-vision`."""
 
 RESUME = "resume.pt"
-"""File in the folder of a trained artifact from which its training can resume. Shipped artifacts do not have it."""
+"""Name of the file from which a training can resume, in the artifact's folder. Shipped artifacts do not have it."""
 
 
 def results_dir(results: str) -> Path:
@@ -58,7 +58,7 @@ def check_writable(results: str) -> Path:
 def artifact(results: str, kind: str, name: str) -> Path:
     """Return the folder of an artifact in the results folder: <results>/artifacts/<kind>/<name>.
 
-    Commands write artifacts only to such folders. To read one that may be elsewhere, use `artifact_or_path`.
+    Commands write artifacts only to such folders. To read an artifact that may be elsewhere, use `artifact_or_path`.
 
     Raises:
         UsageError: `name` cannot be the name of a folder, for example because it contains a slash.
@@ -67,7 +67,9 @@ def artifact(results: str, kind: str, name: str) -> Path:
 
 
 def artifact_or_path(results: str, kind: str, name: str) -> Path:
-    """Return the folder of an artifact to read: `artifact`, or the path `name` if it contains a slash.
+    """Return the folder from which to read an artifact.
+
+    If `name` contains a slash, it is the path of the folder. Otherwise the folder is the result of `artifact`.
 
     Raises:
         UsageError: `name` can be neither a folder's name nor a path.
@@ -83,7 +85,7 @@ def check_name(name: str, what: str) -> str:
         what: What is named, text for the error message.
 
     Raises:
-        UsageError: The name contains other characters than PLAIN_NAME allows.
+        UsageError: The name does not match PLAIN_NAME.
     """
     if not PLAIN_NAME.fullmatch(name):
         raise UsageError(
@@ -119,11 +121,11 @@ def find_target(results: str, name: str) -> Path:
 
     Args:
         results: The results folder.
-        name: Path of the folder, which must contain a slash, or a name. A name is first looked up among the targets in
-            the results folder, then among the shipped policies.
+        name: A path of the folder if it contains a slash, else the target's name. A name is first looked up among the
+            targets in the results folder, then among the shipped policies.
 
     Raises:
-        UsageError: There is no such target. The message lists the existing ones.
+        UsageError: There is no such target, or its training is unfinished. The message says how to get the target.
     """
     policies = results_dir(results) / "pretrained"
     folders = [artifact_or_path(results, "target", name)]
@@ -177,7 +179,7 @@ def beside(target: Path, kind: str) -> Path:
     """Return the default folder of an artifact that belongs to a target. The folder need not exist.
 
     For a shipped target `pretrained/<name>/target` this is `pretrained/<name>/<kind>`, for a trained target
-    `artifacts/target/<name>` it is `artifacts/<kind>/<name>`. For any other target it is a subfolder `<kind>`.
+    `artifacts/target/<name>` it is `artifacts/<kind>/<name>`. For any other target it is `<target>/<kind>`.
 
     Args:
         target: Folder of the target.

@@ -19,11 +19,11 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA
 
 
 def begin_worker(parent: int) -> None:
-    """Prepare this process as a worker. It ignores Ctrl-C, which its parent handles.
+    """Prepare this process as a worker. The worker ignores Ctrl-C, which its parent handles.
 
-    It ends at most a few seconds after its parent. On Linux the kernel ends it, even if it is suspended. The kernel
-    does so, too, when the thread that started this process ends. So start workers from a thread that lives as long as
-    they do. Libraries that have not been imported yet compute in one thread, because the workers share the cores.
+    The worker ends at most a few seconds after its parent. On Linux the kernel ends it, even if it is suspended. The
+    kernel also ends the worker when the thread that started it ends. So start workers from a thread that lives as long
+    as the workers. Libraries that are imported later compute in one thread, because the workers share the cores.
 
     Args:
         parent: Process id of the parent.
@@ -43,7 +43,7 @@ def begin_worker(parent: int) -> None:
 
 
 class Workers(ProcessPoolExecutor):
-    """A pool of worker processes, each a new interpreter. A fork could deadlock in a library that has threads.
+    """A pool of worker processes. Each is a new interpreter, because a fork could deadlock in a library with threads.
 
     Create the pool in a thread that lives as long as the workers; see `begin_worker`.
 
@@ -70,8 +70,8 @@ class Workers(ProcessPoolExecutor):
 def end_with_input() -> None:
     """Make this process end when its standard input is closed, and ignore Ctrl-C.
 
-    The input is a pipe from the parent, which never writes to it. It closes when the parent ends. The parent handles
-    Ctrl-C.
+    The input must be a pipe from the parent. The parent never writes to the pipe. The pipe closes when the parent ends.
+    The parent handles Ctrl-C.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 

@@ -7,7 +7,7 @@ The modules that register kerv's own parts import neither torch nor MuJoCo. A pa
 is built.
 
 Plugins register parts of their own when they are imported. kerv imports the modules that installed packages name in the
-entry point group `kerv.parts`, and those in the environment variable KERV_PLUGINS (separated by commas).
+entry point group `kerv.parts`, and the modules that the environment variable KERV_PLUGINS names, separated by commas.
 """
 
 from __future__ import annotations
@@ -37,26 +37,27 @@ MODULES: Mapping[str, Sequence[str]] = {
     "stress": ("kerv_cli.worlds.stress",),
     "target": ("kerv_cli.targets",),
 }
-"""The modules that register kerv's own parts of a kind, in order. For all other kinds it is METHODS."""
+"""For each kind, the modules that register kerv's own parts, in order. METHODS registers the parts of other kinds."""
 
 METHODS = ("kerv_cli.methods",)
 
 METHOD_KINDS = ("prefill_draft", "proposer", "acceptance", "threshold", "rectifier", "boundary", "skip")
-"""The parts of a method, in the order in which a decode uses them."""
+"""The kinds of parts that make up a method, in the order in which a decode uses them."""
 
 PART_GROUPS = (*METHOD_KINDS, "datastore")
 """Groups of a rollout's settings that choose a part, as in `proposer=drafter`. YAML files in conf/<group>/ are further
 choices."""
 
 SETTINGS_GROUPS = (*PART_GROUPS, "drafter")
-"""The groups of a rollout that choose a part, and `drafter=`, which chooses the drafter that is trained."""
+"""PART_GROUPS, and the group `drafter`, which chooses the drafter that `kerv train drafter` trains."""
 
 DRAFTING = "draft"
-"""Kind of cost of a proposer that drafts with a drafter layer of the target's shape (docs/measuring.md)."""
+"""Kind of cost (docs/measuring.md) of a proposer whose drafter is one decoder layer of the target's shape."""
 
 PREFILL: Literal["prefill"] = "prefill"
 STATES: Literal["states"] = "states"
-"""When a proposer can draft: before the prefill, or only after it, because it reads the target's hidden states."""
+"""When a proposer can draft. PREFILL: before the target's prefill. STATES: only after the prefill, because the proposer
+reads the target's hidden states."""
 
 C = TypeVar("C")
 
@@ -79,8 +80,8 @@ class Part:
         settings: Dataclass of the part's settings, with defaults and limits.
         needs: Kinds of artifacts that the part needs, such as `drafter`, or a function that returns these kinds for
             the part's settings. For an artifact: kinds of artifacts from which it is made.
-        colour: Colour in tables and plots, 0xRRGGBB. None: no colour of its own.
-        idle: Function that takes the part's settings, and maps each setting that has no effect to the reason.
+        colour: Colour in tables and plots, 0xRRGGBB. None if the part has no colour of its own.
+        idle: Function that takes the part's settings. It returns each setting that has no effect, with the reason.
         any_code: For a part of a method: whether it works with tokens that have no distance, see `ActionSpace.code`.
         code: The decorated class or function. None for a name such as `none` in `proposer=none`: the
             method then has no part of this kind.
@@ -131,7 +132,7 @@ class Part:
 
         Args:
             name: Name of the part.
-            what: What the name stands for, text for the error message. Empty: the kind.
+            what: What the name stands for, text for the error message. If empty, the message says the kind.
 
         Raises:
             UnknownName: No part of this kind has the name. The message suggests similar names.
@@ -195,18 +196,18 @@ _PARTS: dict[str, dict[str, Part]] = {}
 
 @dataclass(frozen=True, kw_only=True)
 class ProposerPart(Part):
-    """A proposer.
+    """A registered proposer, which drafts tokens.
 
     Args:
-        when: PREFILL: the proposer reads only the prompt, executed actions and committed tokens. STATES: it reads the
-            target's hidden states.
+        when: PREFILL if the proposer reads only the prompt, executed actions and committed tokens. STATES if it reads
+            the target's hidden states.
         chains: Whether the proposer drafts chains, so that `proposer=merged` and `skip=always` can use it.
         drafts_whole_chunk: Whether it drafts every token of a chunk.
         merged: Whether it merges chains of several proposers.
         has_boundary: Whether a boundary chooses between retrieval and a drafter.
         looks_up: Whether it searches a datastore.
-        cost: Kind of cost in a latency profile that gives the seconds of a draft. Empty: no kind does.
-        measured_by: Name of the method whose run measures this cost. Empty: no method does.
+        cost: Kind of cost under which a latency profile gives the seconds of a draft. Empty if no kind does.
+        measured_by: Name of the method whose decodes measure this cost. Empty if no method does.
     """
 
     kind = "proposer"
@@ -245,13 +246,13 @@ class DrafterPart(ProposerPart):
         return (self.name,)
 
     def built(self, settings: Any, context: Any) -> Any:
-        """Build the proposer; arguments as `Part.built`."""
+        """Build the proposer. `Part.built` explains the arguments."""
         return self.code().proposer(settings, context)
 
 
 @dataclass(frozen=True, kw_only=True)
 class AcceptancePart(Part):
-    """An acceptance rule.
+    """A registered acceptance rule, which decides which draft tokens are accepted.
 
     Args:
         reads_threshold: Whether the rule uses the acceptance radius that the threshold gives.
@@ -268,7 +269,7 @@ class ThresholdPart(Part):
     Args:
         batchable: Whether the part works for several episodes at once.
         radius: Name of the setting with the largest radius, such as `r_max`. A radius that is larger than the largest
-            distance between two tokens is refused. Empty: there is no such setting.
+            distance between two tokens is refused. Empty if there is no such setting.
     """
 
     kind = "threshold"
@@ -313,22 +314,22 @@ class SkipPart(Part):
 
 
 class SearchPart(Part):
-    """A search through a datastore. Its class is an `Index` (`kerv_cli/methods/heisd/__init__.py`)."""
+    """A search through a datastore. The decorated class is an `Index` (`kerv_cli/methods/heisd/__init__.py`)."""
 
     kind = "datastore"
 
 
 @dataclass(frozen=True, kw_only=True)
 class ArtifactPart(Part):
-    """A kind of artifact. The decorated function imports and returns the subclass of `Artifact`.
+    """A kind of artifact. The decorated function returns the subclass of `Artifact` that makes and loads it.
 
     Args:
         sees: Whether the artifact needs a target that reads images.
         by_task: Whether it contains separate numbers or data for each task.
         needs_task: Whether it can be used only for tasks that it contains.
         names_more: Whether its description names further artifacts that it needs.
-        described_by: Name of the file that describes the artifact. Empty: `<kind>.json`.
-        study: Name of the study that makes the artifact. Empty: no study does.
+        described_by: Name of the file that describes the artifact. If empty, it is `<kind>.json`.
+        study: Name of the study that makes the artifact. Empty if no study does.
     """
 
     kind = "artifact"
@@ -345,7 +346,7 @@ class ArtifactPart(Part):
 
 
 class ColumnPart(Part):
-    """A column of tables. The decorated function maps a data frame, the episodes of one setting, to a number."""
+    """A column of tables. The decorated function takes a data frame of one setting's episodes and returns a number."""
 
     kind = "column"
 
@@ -396,8 +397,8 @@ def parts(kind: str, module: str = "") -> Mapping[str, Part]:
 
     Args:
         kind: Kind of part.
-        module: Name of one module in MODULES. Of kerv's own modules, only this one is then imported. Empty: import all
-            modules of the kind.
+        module: Name of a module in MODULES. Of kerv's own modules, only this one is then imported. If empty, all
+            modules of the kind are imported.
     """
     load_plugins()
     if kind == "drafter":

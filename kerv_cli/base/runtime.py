@@ -13,7 +13,7 @@ DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch
 
 
 def set_up(settings: RuntimeSettings) -> tuple[str, torch.dtype]:
-    """Set the number of torch's threads, and resolve the device. A numbered GPU becomes torch's current one.
+    """Set the number of torch's threads, and resolve the device. A numbered GPU becomes torch's current device.
 
     Stopwatches and CUDA graphs use the current device.
 
@@ -21,7 +21,7 @@ def set_up(settings: RuntimeSettings) -> tuple[str, torch.dtype]:
         The device (cpu or cuda instead of `auto`), and the number format of the models.
 
     Raises:
-        UsageError: The device does not exist on this machine.
+        UsageError: The device has an unknown name, or does not exist on this machine.
     """
     device = settings.device if settings.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
     if not re.fullmatch(r"cpu|cuda(:\d+)?", device):

@@ -17,14 +17,14 @@ S = TypeVar("S")
 
 
 def chosen(kind: str, name: str = "none") -> Callable[[], Any]:
-    """Return a `default_factory` for a dataclass field that makes the default settings of the part `name`."""
+    """Return a dataclass field's `default_factory`: a function that makes the default settings of the part `name`."""
     return lambda: find(kind, name).default
 
 
 def part(kind: str, name: str = "none", help: str = "") -> Any:
     """Return a dataclass field that holds the settings of a part, such as a proposer.
 
-    The field's name must be a group of settings, because `NAME=PART` on the command line chooses another part.
+    The field's name must be a group of settings, because `GROUP=PART` on the command line chooses another part.
 
     Args:
         kind: Kind of part.

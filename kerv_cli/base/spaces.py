@@ -50,7 +50,7 @@ class ActionSpace:
         bins: Number of edges on [-1, 1]. A token is the index of one of the bins - 1 intervals (OpenVLA: 256 edges).
         end_token: Whether there is one more token for the value 1. It decodes to the centre of the last interval.
             Published OpenVLA checkpoints were trained with it.
-        code: A code of whole chunks. None: each number of an action is a token of its own, the index of its bin.
+        code: A code of whole chunks. None if each number of an action is a token of its own, the index of its bin.
 
     Raises:
         ValueError: The fields contradict each other.
@@ -101,12 +101,12 @@ class ActionSpace:
 
     @property
     def kinds(self) -> int:
-        """Number of kinds of tokens: D, one per DoF. With a code of whole chunks 1: no token belongs to one DoF."""
+        """Number of kinds of tokens: D, one kind per DoF. With a code of whole chunks, all tokens are of one kind."""
         return 1 if self.code else self.dofs
 
     @property
     def end(self) -> int | None:
-        """The token that ends a chunk. None: all chunks of H control steps have the same number of tokens."""
+        """The token that ends a chunk. None without a code of whole chunks, because all chunks then have N tokens."""
         return self.code.end if self.code else None
 
     @cached_property
@@ -161,15 +161,15 @@ class ActionSpace:
         raise KervError(f"the actions have no group '{name}'")
 
     def segments(self, start: int, stop: int) -> Iterator[tuple[int, int, bool]]:
-        """Divide a part of a chunk's tokens into kinematic groups.
+        """Divide a range of a chunk's tokens into kinematic groups.
 
         Args:
             start: Index of the first token.
             stop: Index after the last token. A group that is only partly inside is cut.
 
         Yields:
-            For each group: index of its first token, index after its last, whether all its DoFs are strict. With a code
-            of whole chunks every token is a group.
+            For each group: index of its first token, index after its last token, whether all its DoFs are strict. With
+            a code of whole chunks, every token is a group that is not strict.
         """
         if self.code is not None:  # no token belongs to one DoF
             for token in range(start, stop):
@@ -183,7 +183,10 @@ class ActionSpace:
             start = last
 
     def strict_tokens(self, size: int) -> np.ndarray:
-        """Return which of a chunk's first `size` tokens belong to strict DoFs, (size,) bool. With a code, all do."""
+        """Return which of a chunk's first `size` tokens belong to strict DoFs, (size,) bool.
+
+        With a code of whole chunks, all tokens count as strict.
+        """
         return np.resize(self.is_strict, size) if self.code is None else np.ones(size, dtype=bool)
 
     def normalise(self, actions: np.ndarray) -> np.ndarray:
@@ -223,7 +226,10 @@ class ActionSpace:
         return self.code.encode(self.code.coefficients(self.normalise(chunks)))
 
     def chunk_values(self, tokens: Sequence[int], steps: int) -> np.ndarray:
-        """Return the normalised actions (h, D) of a chunk's tokens. h is `steps`, or less if tokens are missing."""
+        """Return the normalised actions (h, D) of a chunk's tokens.
+
+        h is len(tokens) / D. With a code of whole chunks, h is `steps`, also if tokens are missing.
+        """
         if self.code is None:
             return self.values_of(np.asarray(tokens)).reshape(-1, self.dofs)
         return self.code.values(self.code.decode(tokens))[:steps]
@@ -240,8 +246,8 @@ class ActionSpace:
             other: The other space.
             here: What this space belongs to, text for the error message.
             there: What the other space belongs to, text for the error message.
-            statistics: Whether to compare `low`, `high` and `end_token` too. If these differ, the same token means a
-                different action.
+            statistics: Whether to compare `low`, `high`, `end_token` and `code`, too. If these differ, the same token
+                means a different action.
 
         Raises:
             CheckpointError: The spaces differ. The message names the first difference.
@@ -282,7 +288,7 @@ class Place:
 
     Args:
         name: Name of the place.
-        first: Index of its x in the state. x, y and z are in metres.
+        first: Index of the place's x coordinate in the state. x, y and z are in metres.
     """
 
     name: str
@@ -303,9 +309,9 @@ class ObservationSpace:
         centre: Middle of the workspace in metres.
         extra_places: Further positions, read only by a policy that gets the state.
         extra: Indices of further numbers in the state, read only by a policy that gets the state.
-        previous: (count, index) if `state[index : index + count]` holds the first `count` numbers of the previous
-            control step. A policy that gets the state reads the differences as velocities. None: the state holds no
-            earlier numbers.
+        previous: (count, index) if `state[index : index + count]` repeats the first `count` numbers of the state one
+            control step earlier. A policy that gets the state reads the differences as velocities. None if the state
+            holds no earlier numbers.
     """
 
     proprioception: tuple[str, ...]
