@@ -32,10 +32,10 @@ PUBLISHED = {
     "Llama-2-13B": (12.9e9, 40, 32_000),
     "Llama-2-70B": (68.7e9, 80, 32_000),
 }
-"""Published language models: weights of layers and head, number of layers, vocabulary. See `language_of`."""
+"""Published language models. For each: weights of layers and head, number of layers, size of the vocabulary."""
 
 SMALL = 50e6
-"""A policy with fewer weights is taken to have 8 layers and a head of action tokens alone, like kerv's own."""
+"""A policy with fewer weights is assumed to have 8 layers and only 256 action tokens, like kerv's own policies."""
 
 _PATCHES = TOWERS["vit_so400m_patch14_siglip_224"].patches
 _SHARE = 0.1  # of the weights are the vision encoder's, as in OpenVLA-7B
@@ -49,9 +49,9 @@ class Described:
 
     Attributes:
         shape: Shape of the policy. None if the policy emits no action tokens.
-        tokens: N, tokens of a chunk.
+        tokens: N, tokens of a chunk. 0 if the policy emits no action tokens.
         assumed: Assumptions about the policy, one phrase each.
-        encoder: Seconds of the vision encoder, if the user states them. None: they are computed from the shape.
+        encoder: Seconds of the vision encoder, if the user states them. None if they are computed from the shape.
     """
 
     shape: Shape | None
@@ -92,7 +92,7 @@ def number_of(name: str, text: str) -> float:
     """Return the number that a text such as `7B`, `450M` or `3.5e9` states.
 
     Args:
-        name: Name of the setting, for the message.
+        name: Name of the setting, for the error message.
         text: The text.
 
     Raises:
@@ -105,11 +105,11 @@ def number_of(name: str, text: str) -> float:
 
 
 def language_of(weights: float) -> Language:
-    """Return a Llama whose layers and head have about this many weights.
+    """Return the shape of a Llama whose layers and head have about this many weights.
 
     The number of layers and the vocabulary are interpolated between the next smaller and the next larger published
-    model, on a logarithmic scale. A layer's feed-forward part is 8/3 as wide as its hidden states, as in Llama. The
-    width follows from the number of weights.
+    model, on a logarithmic scale. Below SMALL weights they are fixed. A layer's feed-forward part is 8/3 as wide as its
+    hidden states, as in Llama. The width of the hidden states follows from the number of weights.
     """
     sizes, layers, vocabularies = np.array([*PUBLISHED.values()]).T
     at = math.log(weights)
@@ -193,11 +193,11 @@ def _of_config(settings: EstimateSettings, config: Mapping[str, Any], file: Path
 
 
 def _size(fields: Mapping[str, Any], key: str, default: int | None = None) -> int:
-    """Return a size of a `config.json`, or `default` if the file does not state it.
+    """Return the size `key` of a `config.json`, or `default` if the file does not state the size.
 
     Raises:
-        TypeError: It is no number, or it is missing and has no default.
-        ValueError: It is below 1.
+        TypeError: The size is missing and has no default, or is a list or mapping.
+        ValueError: The size is below 1, or a text that is not a whole number.
     """
     size = int(fields.get(key, default))
     if size < 1:

@@ -1,7 +1,7 @@
 """Compute what a decode costs on average, from a profile and from how often draft tokens are accepted.
 
-A decode is a prefill, then rounds of a draft and a verification. `engine.cost` gives their costs. The caller says how a
-method drafts, or it is read from a published table. Nothing is run, and this module needs no torch.
+A decode is a prefill, then rounds of a draft and a verification. `engine.cost` gives the costs of these steps. The
+caller says how a method drafts, or a published table does. Nothing is run, and this module needs no torch.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ _STEPS = 2**20  # probabilities that a search distinguishes
 
 @dataclass(frozen=True)
 class Drafts:
-    """How a method drafts, and how much of it runs unverified.
+    """How a method drafts, and which share of its decodes runs unverified.
 
     Attributes:
-        depth: Largest number of tokens in a drafted chain, or of levels in a tree. 0: the method uses no drafter.
-        nodes: Largest number of nodes of a drafted tree. 0: the drafter drafts chains.
-        source: What drafts once per decode instead of the drafter or in addition to it: `early`, `scout` or
-            `retrieval`. Empty: nothing does.
+        depth: Largest number of tokens in a drafted chain, or of levels in a tree. 0 if the method uses no drafter.
+        nodes: Largest number of nodes of a drafted tree. 0 if the drafter drafts chains.
+        source: What drafts once per decode, instead of the drafter or in addition to it: `early`, `scout` or
+            `retrieval`. Empty if nothing does.
         in_prefill: Whether the prefill verifies the draft of `source`.
-        retrieved: Share of the verified decodes in which `source` drafts, not the drafter.
+        retrieved: Share of the verified decodes in which `source` drafts instead of the drafter.
         skipped: Share of the decodes that execute the draft of `source` unverified.
         encodes: Whether an unverified draft needs the target's encoder.
     """
@@ -117,7 +117,7 @@ class Decodes:
     def acceptance_for(self, forwards: float) -> float:
         """Return the smallest acceptance probability at which a verified decode takes `forwards` forwards or fewer.
 
-        Every draft token is accepted with this probability. 1 if no smaller one is enough.
+        The probability is the same for every draft token. It is 1 if no smaller probability is enough.
 
         Args:
             forwards: Mean number of forwards of the target's trunk per decode.
@@ -125,10 +125,11 @@ class Decodes:
         return _least(lambda chance: self.verified([chance]).forwards <= forwards)
 
     def break_even(self) -> Means | None:
-        """Find the acceptance probability of draft tokens at which a verified decode takes as long as AR.
+        """Find the acceptance probability of draft tokens at which a verified decode takes as long as an AR decode.
 
         Returns:
-            The verified decode's mean costs and counts at this probability. None if it is slower even at probability 1.
+            The verified decode's mean seconds and counts at this probability. None if the verified decode is slower
+            than an autoregressive (AR) decode even at probability 1.
         """
         limit = self.profile.decode(self.tokens)
         if self.verified([1.0]).seconds > limit:
@@ -145,7 +146,10 @@ class Decodes:
         return self._cost(self.drafts.source, 1) if self.drafts.source else 0.0
 
     def _round(self, start: int, acceptance: Sequence[float], after: Sequence[Means]) -> Means:
-        """Return the means of the rest of a decode, which begins with a round after `start` committed tokens."""
+        """Return the means of the rest of a decode, which begins with a round after `start` committed tokens.
+
+        `after[i]` holds the means of the rest after i committed tokens, for every i above `start`.
+        """
         drafts, most = self.drafts, self.tokens - start - 1
         if drafts.retrieved == 1:
             return self._forward("verify", 1 + most, most, start, acceptance, after)
@@ -163,7 +167,10 @@ class Decodes:
     def _forward(
         self, kind: str, rows: int, depth: int, start: int, acceptance: Sequence[float], after: Sequence[Means]
     ) -> Means:
-        """Return the means of the rest of a decode, which begins with a forward that verifies `depth` draft tokens."""
+        """Return the means of the rest of a decode, which begins with a forward that verifies `depth` draft tokens.
+
+        The forward has `rows` tokens. `_round` explains `start` and `after`.
+        """
         prompt, reached, feeds = self.profile.prompt * (start == 0), 1.0, self.drafts.depth > 0
         seconds, forwards, taken, verifications = self._cost(kind, rows), 1.0, 0.0, float(depth > 0)
         for accepted in range(depth + 1):
@@ -189,7 +196,7 @@ def _least(enough: Callable[[float], bool]) -> float:
 
 
 TABLES = {"papers": 4, "papers_libero": 7, "main": 16}
-"""Published tables, each with N, the number of tokens per chunk of its decodes."""
+"""The published tables, each with N, the number of tokens per chunk in the table's decodes."""
 
 _SOURCES = {"merged": "early", "early": "early", "scout": "scout", "scoped": "scout", "retrieval": "retrieval"}
 _DRAFTERS = ("drafter", "hybrid")
@@ -201,11 +208,11 @@ class Recorded:
 
     Attributes:
         table: Name of the table.
-        label: Label of the setting.
-        method: Name of its method.
+        label: Label (name) of the setting.
+        method: Name of the setting's method.
         tokens: N, number of tokens in a chunk.
         drafts: How the setting drafted.
-        forwards: Forwards of the trunk per verified decode.
+        forwards: Mean number of forwards of the target's trunk per verified decode.
         speed: Measured speed against AR, per control step.
     """
 
@@ -219,7 +226,7 @@ class Recorded:
 
 
 def nearest_tables(tokens: int) -> list[str]:
-    """Return the published tables, sorted by how close their chunks' length is to `tokens` tokens."""
+    """Return the names of the published tables, sorted by the distance of their chunk length from `tokens` tokens."""
     return sorted(TABLES, key=lambda name: abs(TABLES[name] - tokens))
 
 
@@ -259,9 +266,9 @@ def _drafts(settings: Mapping[str, Any], skipped: float, retrieved: float) -> Dr
     """Return how a setting drafts.
 
     Args:
-        settings: Its settings.
-        skipped: Share of its decodes that ran unverified.
-        retrieved: Share of its decodes that retrieved a draft.
+        settings: Rollout settings, as nested dictionaries.
+        skipped: Share of the setting's decodes that ran unverified.
+        retrieved: Share of the setting's decodes that retrieved a draft, also unverified ones.
     """
     proposer, before = settings["proposer"], settings["prefill_draft"]["kind"]
     hybrid = proposer["kind"] == "hybrid"

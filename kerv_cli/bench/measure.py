@@ -141,9 +141,9 @@ class Phase:
         seconds: Median of all repeats.
         p95: 95th percentile of all repeats.
         least: Minimum of all repeats.
-        read: Bytes that the phase must read. 0: unknown.
-        flops: Arithmetic operations that the phase needs. 0: unknown.
-        floor: Shortest possible seconds for these bytes and operations on this device. 0: unknown.
+        read: Bytes that the phase must read. 0 if unknown.
+        flops: Arithmetic operations that the phase needs. 0 if unknown.
+        floor: Shortest possible seconds for these bytes and operations on this device. 0 if unknown.
     """
 
     kind: str
@@ -163,9 +163,9 @@ class Phase:
         return f"{self.kind} {self.rows}" if self.kind in FORWARDS[1:] else self.kind
 
     def as_dict(self) -> dict[str, float | str]:
-        """Return the fields for JSON, and the phase's name, the GB/s and GFLOP/s that it reached, and its share.
+        """Return the fields for JSON, with the phase's name, the reached GB/s and GFLOP/s, and the share.
 
-        The share is the shortest possible time ÷ the median: 1 if the phase is as fast as the device allows.
+        The share is `floor` ÷ `seconds`. It is 1 if the phase is as fast as the device allows.
         """
         rates = {"gb_per_s": self.read / self.seconds / 1e9, "gflop_per_s": self.flops / self.seconds / 1e9}
         return {"name": self.name, **asdict(self), **rates, "share": self.floor / self.seconds}
@@ -235,7 +235,7 @@ def decoders(model: Model) -> list[Decoder]:
 def costs_of(
     decoder: Decoder, prompt: int, rounds: Sequence[Round], laps: Sequence[Lap]
 ) -> Iterator[tuple[Key, float]]:
-    """Yield each phase in a decode: its kind and rows, as in `Phase`, and its seconds.
+    """Yield the kind, rows (both as in `Phase`) and seconds of each phase of a decode.
 
     A forward's seconds include copying the target's tokens to the CPU.
 
@@ -305,7 +305,7 @@ def profile_of(phases: Sequence[Phase], tokens: int) -> Profile:
 
 @torch.inference_mode()
 def needs_of_draft(decoder: Any) -> tuple[float, float]:
-    """Return the bytes and the number of arithmetic operations that one prefill draft needs.
+    """Return the bytes and the number of arithmetic operations that one prefill draft of a decoder needs.
 
     These are the bytes and operations of the network that makes the draft. Both are 0 if no network makes it.
     """
@@ -345,7 +345,7 @@ def source_decoders(settings: BenchSettings) -> dict[str, Any]:
 def card_of(model: Model, machine: Machine) -> dict[str, Any]:
     """Compute the shortest times that a model's forwards can take on this device. No forward is executed.
 
-    A shortest time (floor) has two parts in seconds: one for reading memory, one for arithmetic. The larger one counts.
+    A shortest time (floor) has two parts in seconds: one for reading memory, one for arithmetic. The longer one counts.
 
     Args:
         model: The model.

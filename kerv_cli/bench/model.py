@@ -83,8 +83,8 @@ class Model:
 def random_target(shape: TargetSettings, device: torch.device, dtype: torch.dtype) -> CompactTarget:
     """Return a compact target with random weights, for inference.
 
-    Its layers are made one after the other, so that memory never holds all weights of a large model twice. The weights
-    are rounded to half precision, as the shipped ones are.
+    The layers are made one after the other, so that memory never holds all weights of a large model twice. The weights
+    are rounded to half precision, as the weights of the shipped targets are.
 
     Args:
         shape: Settings of the target: its width, layers and so on.
@@ -112,7 +112,7 @@ def open_model(settings: BenchSettings) -> Model:
     A shape, or a policy without a drafter, gets a drafter with random weights.
 
     Raises:
-        UsageError: There is too little memory for the shape.
+        UsageError: There is too little memory for the shape, or the policy's target has no `layers` to count.
         UnknownName: There is neither a policy nor a shape of that name.
         CheckpointError: The policy is damaged.
     """

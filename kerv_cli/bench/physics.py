@@ -23,17 +23,17 @@ _ENCODER = 20  # kernels of an encoder outside its blocks
 _ROWS = (1, 2, 4, 8, 16, 32, 64)
 SYSTEM = "system time"
 CHUNK = 64
-"""Largest number of tokens per chunk that a computed profile prices."""
+"""Largest number of tokens per chunk for which a computed profile has times."""
 
 
 @dataclass(frozen=True)
 class Device:
-    """A GPU, or a board with one.
+    """A GPU, or a computer board that has one.
 
     Attributes:
         title: Name in tables.
-        bandwidth: Published bytes per second of its memory.
-        flops: Published operations per second in bfloat16: dense, sums in float32.
+        bandwidth: Published bytes per second of the device's memory.
+        flops: Published operations per second of dense matrix multiplications in bfloat16 with sums in float32.
     """
 
     title: str
@@ -55,11 +55,11 @@ class Needs(NamedTuple):
     """What a phase of a decode needs on any device.
 
     Attributes:
-        read: Bytes that are read.
-        flops: Arithmetic operations.
-        layers: Layers of the language model or drafter that run one after the other.
-        blocks: Blocks of a vision encoder that run one after the other.
-        kernels: Kernels outside of layers and blocks.
+        read: Number of bytes that are read.
+        flops: Number of arithmetic operations.
+        layers: Number of layers of the language model or drafter that run one after the other.
+        blocks: Number of blocks of a vision encoder that run one after the other.
+        kernels: Number of GPU kernels outside of these layers and blocks.
         asks: Whether the phase runs the target's encoder or trunk.
     """
 
@@ -75,12 +75,13 @@ class Needs(NamedTuple):
 class Engine:
     """How a program executes a decode.
 
-    A phase takes its floor ÷ `share`, or the time of launching its kernels if that is longer, plus the system time.
+    A phase takes its floor (shortest time that the device allows) ÷ `share`, or the time of launching its kernels if
+    that is longer. The system time is added.
 
     Attributes:
         name: Name of the engine.
-        share: Share of the device's bandwidth and rate that the program reaches.
-        launch: Seconds of launching a kernel.
+        share: Share of the device's bandwidth and operations per second that the program reaches.
+        launch: Seconds of launching one kernel.
         layer: Number of kernels per layer of the language model or of the drafter.
         block: Number of kernels per block of a vision encoder.
         system: Further seconds of each run of the target's encoder or trunk.
@@ -96,7 +97,7 @@ class Engine:
     source: str
 
     def times(self, needs: Needs, device: Device) -> dict[str, float]:
-        """Return the seconds of reading, arithmetic, launches and system time.
+        """Return the seconds of `reading`, `arithmetic`, `launches` and `system time` in a phase, by these names.
 
         A phase takes the longest of the first three times, plus the system time.
         """
@@ -115,13 +116,14 @@ class Engine:
         return max(times.values()) + system
 
     def bound(self, needs: Needs, device: Device) -> str:
-        """Return what takes most of the phase's time: a key of the result of `times`."""
+        """Return what takes longest in a phase with these needs, as a key of the result of `times`."""
         times = self.times(needs, device)
         return max(times, key=times.__getitem__)
 
 
 SHARE = 0.69
-"""Share of the peak: gpt-fast reads 1,397 of an A100's 2,039 GB/s with Llama-2 7B, one sequence, in bfloat16."""
+"""Share of the published bandwidth and operations per second that engines are assumed to reach. gpt-fast reads 1,397 of
+an A100's 2,039 GB/s with Llama-2 7B, one sequence, in bfloat16."""
 
 ENGINES = {
     "tuned": Engine(
@@ -146,7 +148,7 @@ ENGINES = {
 }
 """Engines by name. *tuned*: captured graphs and fused kernels. *eager*: the code that the papers measure."""
 ROOFLINE = Engine("roofline", 1.0, 0.0, 0, 0, 0.0, "the floor: the longer of reading and computing")
-"""An engine that takes no longer than the floor."""
+"""An ideal engine. Every phase takes exactly its floor, the shortest time that the device allows."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +161,7 @@ class Sizes:
         drafter: Number of weights that a pass of the drafter reads, the head's included.
         channels: Number of attention channels, summed over all layers. Each takes four operations for every key that a
             token attends to.
-        cached: Numbers in the key/value cache per token.
+        cached: Count of numbers that the key/value cache holds for each token, over all layers.
         weight: Bytes of a weight, on average.
         slot: Bytes of a number in the key/value cache.
         padding: Number of tokens that a prefill computes beyond the prompt. 0 except for grown targets, which are
@@ -205,7 +207,7 @@ class Sizes:
 
         Args:
             rows: Number of tokens in the forward, without `padding`. This method adds `padding` to a prefill.
-            cached: Number of earlier tokens in the cache. 0: a prefill.
+            cached: Number of earlier tokens in the cache. 0 for a prefill.
         """
         rows += 0 if cached else self.padding
         read = self.trunk_weights * self.weight + float(self.cached) * (cached + rows) * self.slot
@@ -286,7 +288,9 @@ def priced(shape: Shape, device: Device, engine: Engine) -> Profile:
 
 
 def encoder_of(towers: Sequence[Tower], width: int) -> Needs:
-    """Return what OpenVLA's encoder needs: all blocks but the last of each tower, and the projector of three layers.
+    """Return what OpenVLA's encoder needs.
+
+    In each tower it runs all blocks but the last. A projector of three layers follows.
 
     Args:
         towers: Shapes of the encoder's vision transformers.
@@ -310,8 +314,8 @@ def encoder_of_weights(weights: float, tokens: int) -> Needs:
     """Return what a vision encoder of a given size reads and computes.
 
     Args:
-        weights: Number of weights. Each is used once per token. 0: there is no encoder.
-        tokens: Number of tokens that the encoder makes.
+        weights: Number of weights. Each is used once per token. 0 if there is no encoder.
+        tokens: Number of tokens that the encoder outputs.
     """
     blocks = 0 if not weights else 27 if weights > 200e6 else 12  # SigLIP So400m's and ViT-B's
     return Needs(_HALF * weights, 2.0 * weights * tokens, blocks=blocks, kernels=_ENCODER * bool(weights), asks=True)
@@ -322,9 +326,9 @@ def vla_shape(name: str, language: Language, prompt: int, encoder: Needs) -> Sha
 
     Args:
         name: Name of the model.
-        language: Shape of its language model.
+        language: Shape of the VLA's language model.
         prompt: P, number of prompt tokens.
-        encoder: What its vision encoder needs.
+        encoder: What the VLA's vision encoder needs.
     """
     width, sizes = language.hidden_size, Sizes.of(language, _HALF)
     # The early drafter reads two pooled vectors, has two blocks of 384 units and spreads 32 features over 7 tokens. Its
@@ -347,7 +351,7 @@ def openvla(name: str, language: Language, towers: Sequence[Tower]) -> Shape:
 
 
 INSTRUCTION = 25
-"""Number of prompt tokens of an instruction."""
+"""Assumed number of prompt tokens of an instruction."""
 GEMMA = Language(257_152, 2048, 16_384, 18, 8, 1)
 """PaliGemma's language model, Gemma 2B."""
 SHAPES = {

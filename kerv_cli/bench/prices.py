@@ -1,6 +1,6 @@
 """Price decodes: what an action costs on a GPU, and how fast each family of methods can be.
 
-Nothing is run and nothing is measured. This module needs no torch. `tables.py` shows what is computed here. AR is
+Nothing is run and nothing is measured. This module needs no torch. `tables.py` turns the results into text. AR is
 autoregressive decoding.
 """
 
@@ -31,11 +31,11 @@ class Family:
     Attributes:
         name: Name in the table.
         method: Method of `conf/method` that represents the family.
-        drafts: How the methods draft in the fastest case: every decode that may retrieve its draft does, and every
-            decode that may skip verification does.
-        length: Published mean number of tokens committed per verification, for chunks of seven tokens. None: not
-            published.
-        reported: Speed against AR that the paper reports for its own machine. Empty: the paper reports none.
+        drafts: How the methods draft in the fastest case. In this case every decode that may retrieve its draft does,
+            and every decode that may skip verification does.
+        length: Published mean number of tokens committed per verification, for chunks of seven tokens. None if it is
+            not published.
+        reported: Speed against AR that the paper reports for its own machine. Empty if the paper reports none.
     """
 
     name: str
@@ -67,7 +67,7 @@ ACTION = 7
 
 
 def computed(policy: Described, device: Device) -> Iterator[NamedProfile]:
-    """Yield the costs of a policy on a device: one profile for each engine, with the engine's name."""
+    """Yield the costs of a policy on a device, one profile for each engine. The profile has the engine's name."""
     shape, encoder = policy.shape, policy.encoder
     assert shape is not None
     for engine in ENGINES.values():
@@ -83,9 +83,9 @@ def computed(policy: Described, device: Device) -> Iterator[NamedProfile]:
 
 
 def costs_of(settings: EstimateSettings, policy: Described | None) -> Iterator[tuple[str, NamedProfile]]:
-    """Yield the costs of a policy on each machine with each engine, beside the machine's title.
+    """Yield the title of a machine and the costs of a policy on it, for each machine and each engine.
 
-    Without a policy, yield the costs of each profile of `settings.on`.
+    Without a policy, yield the title and the costs of each profile in `settings.on`.
     """
     if policy is None:
         for one in open_profiles(settings.results, settings.on):
@@ -102,14 +102,15 @@ class Answer:
 
     Attributes:
         family: Name of the family.
-        method: Method that represents it.
+        method: Method that represents the family.
         ceiling: Speed if every draft token is accepted, and every decode that may skip verification does.
-        at_published_acceptance: Speed at the acceptance that the paper reports. None: it reports none.
-        paper_reports: Speed that the paper reports for its own machine. None: it reports none.
-        at_own_acceptance: Speed at the acceptance that kerv measured. None: kerv's published table lacks this family.
-        own_acceptance_from: The table and its setting with which that acceptance was measured.
-        break_even_tokens: Accepted draft tokens per verification at which the family is as fast as AR. None: the family
-            is always slower, or it skips verification.
+        at_published_acceptance: Speed at the acceptance that the paper reports. None if the paper reports none.
+        paper_reports: Speed that the paper reports for its own machine. None if the paper reports none.
+        at_own_acceptance: Speed at the acceptance that kerv measured. None if no published table has it.
+        own_acceptance_from: The published table, and the setting in it, in which kerv measured this acceptance. None if
+            `at_own_acceptance` is None.
+        break_even_tokens: Accepted draft tokens per verification at which the family is as fast as AR. None if the
+            family is always slower, or skips verification.
         is_verified: Whether the family never skips verification.
     """
 
@@ -184,8 +185,8 @@ class Estimate:
 def closest(tokens: int, family: Family) -> Recorded | None:
     """Return a published setting that has a family's method and drafts as the family does (a chain or a tree).
 
-    It is the first such setting of the table whose chunks have about `tokens` tokens. If that table has none, the other
-    tables are searched. None if no table has such a setting.
+    The tables are searched in the order of how close the length of their chunks is to `tokens` tokens. The first such
+    setting is returned. None if no table has such a setting.
     """
     for table in nearest_tables(tokens):
         for one in recorded(table):
@@ -200,10 +201,10 @@ class Anchor:
 
     Attributes:
         device: Name in `DEVICES`.
-        engine: The engine that was timed. `ROOFLINE`: the source computed the shortest possible time.
+        engine: The engine that was timed. It is `ROOFLINE` if the source computed the shortest possible time.
         low: Shortest published time, milliseconds.
         high: Longest published time, milliseconds.
-        source: Who published it.
+        source: Who published the time.
         weight: Bytes per weight of the language model.
     """
 
@@ -230,7 +231,7 @@ ANCHORS = (
     Anchor("3090", ENGINES["eager"], 283, 283, "Hugging Face code (2026-07)"),
     Anchor("orin", ENGINES["tuned"], 345, 400, "2.5 to 2.9 actions per second in int4", weight=0.5),
 )
-"""Published times of OpenVLA-7B. `tests/test_physics.py` compares them with ours, docs/measuring.md prints them."""
+"""Published times of OpenVLA-7B. `tests/test_physics.py` compares them with `ours`. docs/measuring.md has both."""
 
 
 @dataclass(frozen=True)
@@ -253,7 +254,7 @@ class Projection:
 
     @property
     def document(self) -> dict[str, Any]:
-        """The projection for JSON (docs/formats.md)."""
+        """The projection as values for JSON (docs/formats.md)."""
         profile = self.profile.as_dict()
         for costs in profile["phases"].values():
             costs["seconds"] = [float(f"{seconds:.4g}") for seconds in costs["seconds"]]
@@ -273,7 +274,7 @@ class Projection:
 
 
 def projections(settings: BenchSettings) -> Iterator[Projection]:
-    """Yield the times of the shape `settings.projected`, on each of its devices with each engine."""
+    """Yield the times of the shape `settings.projected` on each device of `settings.projections` with each engine."""
     shape: Shape = SHAPES[settings.projected]
     for name, (bandwidth, flops) in settings.projections.items():
         title = DEVICES[name].title if name in DEVICES else name

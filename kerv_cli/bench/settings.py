@@ -44,7 +44,7 @@ class BenchSettings(RunSettings):
 
 @dataclass
 class EstimateSettings(CommandSettings):
-    """Settings of `kerv estimate`, which computes what speculation can give a policy. Nothing is run."""
+    """Settings of `kerv estimate`, which computes how much speculation can speed up a policy. Nothing is run."""
 
     weights: str = setting("", "weights of the policy, encoder included: 7B, 450M; the rest of its shape is assumed")
     model: str = setting("", "instead: a Hugging Face config.json or its folder, a target of kerv, or openvla-7b")
@@ -68,7 +68,7 @@ class EstimateSettings(CommandSettings):
             prefix: Start of the settings' names in error messages.
 
         Raises:
-            UsageError: A device is unknown, there is nothing to choose from, or the costs are named twice.
+            UsageError: A device is unknown, `choose` is set without `trace`, or `on` is set together with a policy.
         """
         if self.choose != "none" and not self.trace:
             raise UsageError(f"{prefix}choose={self.choose} needs trace=FILE", f"{prefix}choose")

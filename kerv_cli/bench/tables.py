@@ -103,7 +103,7 @@ def family_rows(estimates: Sequence[Estimate]) -> Iterator[Row]:
 
 
 def _numbers(answers: Iterable[Answer], name: str, none: str = "–") -> str:
-    """Return a field of several answers as a cell; `none` stands for None."""
+    """Return the field `name` of several answers as one cell. The text `none` stands for None."""
     texts = []
     for answer in answers:
         value = getattr(answer, name)
@@ -112,12 +112,12 @@ def _numbers(answers: Iterable[Answer], name: str, none: str = "–") -> str:
 
 
 def _beside(texts: Sequence[str]) -> str:
-    """Return the texts as one cell, side by side. If all are equal, the cell has the text once."""
+    """Return the texts as one cell, side by side. If all texts are equal, the cell has the text once."""
     return texts[0] if len(set(texts)) == 1 else " / ".join(texts)
 
 
 def trace_row(found: Mapping[str, Any]) -> dict[str, object]:
-    """Return a row about a setting of a trace, from `trace.price` or `trace.choose_length`."""
+    """Return a row about a setting of a trace, from a result of `trace.price` or `trace.choose_length`."""
     if "best" not in found:
         row: dict[str, object] = {name: found[name] for name in ("setting", "tokens", "episodes", "decodes")}
         for name in ("decode", "episode"):
@@ -135,7 +135,7 @@ def trace_row(found: Mapping[str, Any]) -> dict[str, object]:
 
 
 def _speed(found: Mapping[str, float]) -> str:
-    """Return a speed as text, with its interval if there is one."""
+    """Return a speed as text, with its 95 % interval unless the interval is NaN."""
     interval = "" if math.isnan(found["low"]) else f" ({found['low']:.2f}–{found['high']:.2f})"
     return f"{found['speed']:.2f}{interval}"
 
@@ -177,7 +177,7 @@ def rate(estimates: Sequence[Estimate], hz: float, actions: int) -> str:
 
     Args:
         estimates: Estimates of one policy on one device, one per engine.
-        hz: Control steps per second.
+        hz: Control steps per second that the robot needs.
         actions: Control steps per chunk.
     """
     limit, words = actions / hz, []

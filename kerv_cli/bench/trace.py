@@ -26,7 +26,8 @@ from kerv_cli.report.profiles import NamedProfile
 
 MOST = 1_000_000  # of every count in a trace
 MODES = ("forward", "skip", PARALLEL)
-"""Modes of a round: the target ran, a draft was executed without a forward, or one forward gave all tokens."""
+"""Modes of a round. `forward`: the target ran. `skip`: a draft was executed without a forward. `parallel`: one forward
+gave all tokens."""
 _RESAMPLES = 200
 _SEED = 0
 
@@ -43,11 +44,11 @@ class TracedRound:
     The default values describe a forward without a draft that commits one token.
 
     Attributes:
-        start: Number of tokens committed before this forward. 0: it reads the prompt.
-        parents: Index of each draft node's parent. −1: the node follows the last committed token. Empty: unknown, or no
-            draft.
+        start: Number of tokens committed before this forward. 0 if this forward reads the prompt.
+        parents: Index of each draft node's parent, or −1 if the node follows the last committed token. Empty if the
+            parents are unknown, or if there is no draft.
         nodes: Number of draft nodes. Only needed if `parents` is empty.
-        levels: Number of levels of a drafted tree. 0: a chain, or computed from `parents`.
+        levels: Number of levels of a drafted tree. 0 for a chain, or if `parents` states the tree.
         accepted: Number of accepted draft tokens.
         committed: Number of committed tokens, the target's own token included.
         proposer: Name of the proposer that drafted: `none`, or a proposer of kerv with the same cost.
@@ -99,7 +100,7 @@ class TracedDecode:
         tokens: N, number of tokens of the chunk.
         rounds: The decode's rounds in order.
         setting: Name of the setting that decoded, such as a method's name.
-        prompt: Number of prompt tokens. None: unknown.
+        prompt: Number of prompt tokens. None if unknown.
         encoded: Whether the target's vision encoder ran.
         searched: Whether a datastore was searched although no round drafted with the result.
         seconds: Seconds by phase, as far as they are known: `propose`, `accept`, `rectify`, `other`.
@@ -149,7 +150,7 @@ def read_trace(path: Path) -> list[TracedDecode]:
 
 
 def grouped(decodes: Sequence[TracedDecode]) -> dict[tuple[str, int], list[TracedDecode]]:
-    """Return the decodes of each setting with each number N of tokens per chunk."""
+    """Group decodes by their setting and N, the number of tokens per chunk. The keys are (setting, N)."""
     groups: dict[tuple[str, int], list[TracedDecode]] = {}
     for one in decodes:
         groups.setdefault((one.setting, one.tokens), []).append(one)
@@ -157,7 +158,7 @@ def grouped(decodes: Sequence[TracedDecode]) -> dict[tuple[str, int], list[Trace
 
 
 def work_of_trace(decodes: Sequence[TracedDecode], tokens: int) -> Work:
-    """Count the forwards and drafts of some decodes, and sum their other seconds.
+    """Return what some decodes computed: their forwards, their drafts, and the seconds of all other phases.
 
     Args:
         decodes: The decodes, all of the same chunk length.
@@ -206,7 +207,7 @@ def _ratio(one: np.ndarray, other: np.ndarray, chosen: np.ndarray) -> list[float
 
 
 def _numbers(decodes: Sequence[TracedDecode]) -> np.ndarray:
-    """Return the number of each decode's episode, from 0, (decodes,)."""
+    """Number the episodes from 0. Return the number of each decode's episode, (decodes,)."""
     numbers: dict[str, int] = {}
     return np.array([numbers.setdefault(one.episode, len(numbers)) for one in decodes])
 
@@ -214,15 +215,15 @@ def _numbers(decodes: Sequence[TracedDecode]) -> np.ndarray:
 def _resampled(
     episodes: int, speeds_of: Callable[[np.ndarray], Sequence[float]]
 ) -> tuple[list[dict[str, float]], float]:
-    """Return speeds with their intervals over episodes that are drawn with replacement.
+    """Return one or more speeds with intervals, which come from drawing the episodes many times with replacement.
 
     Args:
         episodes: Number of episodes.
-        speeds_of: Function that takes the numbers of the drawn episodes and returns the speeds.
+        speeds_of: Function that takes the numbers of the drawn episodes, and returns one speed per choice.
 
     Returns:
-        The speeds over all episodes, with their 95 % intervals. And the share of the draws in which the fastest choice
-        is the same as over all episodes. Intervals and share are NaN if there is only one episode.
+        The speed of each choice over all episodes, with its 95 % interval. And the share of the draws in which the same
+        choice is the fastest as over all episodes. Intervals and share are NaN if there is only one episode.
     """
     speeds, same = speeds_of(np.arange(episodes)), np.nan
     low = high = [np.nan] * len(speeds)
@@ -266,7 +267,10 @@ def choose_length(trace: Sequence[TracedDecode], costs: NamedProfile) -> list[di
 
 
 def _speeds(plans: Sequence[Decodes], tried: np.ndarray, accepted: np.ndarray, chosen: np.ndarray) -> list[float]:
-    """Return the speed of each plan with the acceptance of the chosen episodes."""
+    """Return the speed of each plan, if tokens are accepted as often as in the chosen episodes.
+
+    `_counts` explains `tried` and `accepted`, (episodes, longest chain). `chosen` holds numbers of episodes.
+    """
     chances = (accepted[chosen].sum(0) / np.maximum(tried[chosen].sum(0), 1)).tolist()
     return [plan.speed(chances) for plan in plans]
 
