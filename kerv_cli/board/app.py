@@ -40,7 +40,7 @@ LAST_ANSWERS = 1.0
 class SameOrigin:
     """Refuse requests that change something, if the page of another site sends them.
 
-    Browsers send the header Origin with every such request. Programs such as curl do not, and may pass.
+    Browsers send the header Origin with every such request. Programs such as curl do not send it, and may pass.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -60,7 +60,7 @@ class Impatient(H11Protocol):
     """A connection that is closed if it sends no complete request for PATIENCE seconds."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to serve a connection."""
+        """Begin to serve a connection, and to check it every PATIENCE seconds."""
         super().connection_made(transport)
         self.loop.call_later(PATIENCE, self._check, None)
 
@@ -68,7 +68,7 @@ class Impatient(H11Protocol):
         """Close the connection if it waits for a request and has sent none since the last check.
 
         Args:
-            before: The newest request at the last check. None: there was none yet.
+            before: The newest request at the last check. None if there was no request yet.
         """
         waits = self.cycle is None or self.cycle.response_complete
         if waits and self.cycle is before:
@@ -96,7 +96,7 @@ def make_app(database: Database) -> Starlette:
 
 
 def failed(request: Request, error: Exception) -> Response:
-    """Return the page for an error: 404 if something does not exist, 500 if something is damaged."""
+    """Return the page for an error. Its status is 404 if something does not exist, 500 if something is damaged."""
     if isinstance(error, HTTPException):
         return render(request, "error.html", error.status_code, reason=error.detail)
     reason = str(error) if isinstance(error, KervError) else f"internal error, {type(error).__name__}: {error}"
@@ -118,12 +118,12 @@ def serve(database: Database, port: int, opened: Callable[[str], None], browser:
 
     Args:
         database: The database to show.
-        port: Port to listen on; 0: a free one.
+        port: Port to listen on. If 0, a free port is used.
         opened: Called with the address as soon as the port is open.
         browser: Whether to open the address in the browser.
 
     Raises:
-        UsageError: The port is taken.
+        UsageError: The port cannot be used, for example because another program uses it.
     """
     server = web_server(database)
     with socket.socket() as listening:

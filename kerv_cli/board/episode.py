@@ -41,17 +41,17 @@ from kerv_cli.report.viewing.viewer import Film, animation, film_of, viewer_comm
 from kerv_cli.worlds import specs
 
 SLOWER = 2
-"""How many times slower than the robot a film plays."""
+"""Factor by which a film plays slower than the robot moves."""
 IDLE_SECONDS = 60
 """Seconds without work after which the recording process ends, to free its memory."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """A recording that was asked for.
+    """A recording that the user asked for.
 
     Attributes:
-        future: Its result is the error as text, or empty once the recording is written.
+        future: Running job. Its result is the error as text, or an empty text if the recording was written.
         asked: Time at which the user asked for it, seconds since 1970.
     """
 
@@ -73,7 +73,7 @@ class Job:
 
 
 class Recorder:
-    """Records episodes. A recording that was asked for twice is made once."""
+    """Records episodes in one process. Asking for an episode that is being recorded already does nothing."""
 
     def __init__(self) -> None:
         self._jobs: dict[Path, Job] = {}
@@ -82,7 +82,7 @@ class Recorder:
         self._lock = threading.RLock()
 
     def job(self, path: Path) -> Job | None:
-        """Return the newest job that writes this file. None if nobody asked for one."""
+        """Return the newest job that writes this file. None if nobody asked for such a job."""
         return self._jobs.get(path)
 
     def record(self, found: FoundEpisode) -> None:
@@ -104,7 +104,7 @@ class Recorder:
         work.add_done_callback(self._rest)
 
     def _rest(self, work: Future[str]) -> None:
-        """End the process after IDLE_SECONDS, unless another recording was asked for after this one."""
+        """End the recording process after IDLE_SECONDS, unless a newer recording than `work` was asked for."""
 
         def end() -> None:
             with self._lock:
@@ -116,7 +116,7 @@ class Recorder:
         timer.start()
 
     def close(self) -> None:
-        """End the process, whatever it is recording."""
+        """End the recording process at once, even during a recording."""
         if self._pool is not None:
             self._pool.kill()
             self._pool = None
@@ -133,7 +133,7 @@ def record_episode(setting: Setting, task: str, seeds: list[int], results: str, 
         path: File to write.
 
     Returns:
-        The error in one line. Empty if all went well.
+        The error in one line. Empty if the recording was written.
     """
     from kerv_cli.episodes.runner import Runner
     from kerv_cli.lab.work import checked, failure_of
@@ -161,7 +161,7 @@ def _film(request: Request) -> Film:
 
 
 def _names(task: str, decodes: Sequence[DecodeRecord]) -> Sequence[str]:
-    """Return the names of the D degrees of freedom of a task, or their numbers if its environment is not known here."""
+    """Return the names of the D degrees of freedom of a task. If the task is unknown here, the names are 0, 1, …."""
     dofs = max((decode.actions.shape[1] for decode in decodes if decode.actions.ndim == 2), default=1)
     for spec in specs().values():
         if task in spec.tasks and len(spec.actions.names) == dofs:
@@ -226,7 +226,7 @@ def _film_values(
         request: The request.
         found: The episode.
         step: Control step to show first.
-        decodes: Decodes of the episode. None: read them when they are needed.
+        decodes: Decodes of the episode. If None, they are read when they are needed.
     """
     job = RECORDER.job(found.recording)
     values: dict[str, Any] = {"found": found, "step": step, "job": job, "film": None, "same": None, "rerun": ""}
@@ -248,8 +248,11 @@ def show_film(request: Request) -> Response:
 async def record(request: Request) -> Response:
     """Start to record an episode, unless it is being recorded already.
 
-    The recording process is started in this function's thread, which lives as long as the board. Threads that make
-    pages end earlier, and the kernel ends a process when the thread that started it ends (`begin_worker`).
+    The recording process is started in this function's thread, which lives as long as the board. The other threads,
+    which make pages, end earlier. The kernel ends a process when the thread that started it ends (`begin_worker`).
+
+    Raises:
+        HTTPException: The episode was imported.
     """
     found = await run_in_threadpool(_found, request)
     if found.store.kind == IMPORT:
@@ -262,7 +265,7 @@ _FOREVER = {"cache-control": "max-age=86400"}
 
 
 def frame(request: Request) -> Response:
-    """Return the image after the control step that the address names. Step 0 is the image at the start."""
+    """Return the film's image after the control step that the address names. Image 0 shows the start."""
     frames, step = _film(request).frames, request.path_params["step"]
     if step >= len(frames):
         raise HTTPException(404, f"the film has {len(frames)} frames, numbered from 0")

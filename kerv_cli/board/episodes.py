@@ -30,13 +30,13 @@ OUTCOMES = {
     ERROR: ("!", "could not run"),
     MISSING: ("·", "not run yet"),
 }
-"""Kind of outcome -> its symbol and meaning, in the order of the key."""
+"""Maps each kind of outcome to its symbol and its meaning, in the order of the page's legend."""
 FAILURES = (LOST, FAILURE)
 
 MOST_SHOWN = 24
-"""Largest number of episodes that the page lists of one group of failures."""
+"""Largest number of episodes that the page lists for each group of failures."""
 MOVED = 0.01
-"""Metres. If the object moved at least this far, a failure counts as after contact."""
+"""Distance in metres. If the object moved at least this far, a failure counts as after contact."""
 PHASES = {
     "before contact": "the fingertips never came within 2 cm of the object, and did not move it",
     "near contact": "they came within 2 cm, and the object moved less than 1 cm",
@@ -44,15 +44,15 @@ PHASES = {
     "near or after contact": "they came within 2 cm; an older kerv did not store how far the object moved",
     "unknown": "the task has no object, or the distance was not stored",
 }
-"""Phase of the task in which an episode failed -> what it means."""
+"""Maps each phase of a task in which an episode can fail to what the phase means."""
 
 
 def phase_of(closest: float | None, moved: float | None) -> str:
     """Return the phase of the task in which an episode failed, a key of PHASES.
 
     Args:
-        closest: Least distance of the fingertips to the object, metres.
-        moved: How far the object moved after the fingertips came near it, metres.
+        closest: Least distance of the fingertips to the object, metres. None if unknown.
+        moved: How far the object moved after the fingertips came near it, metres. None if unknown.
     """
     if closest is None:
         return "unknown"
@@ -71,7 +71,7 @@ class Cell:
         label: Label of the episode's setting.
         task: Name of the episode's task.
         seed: Seed of the episode.
-        episode: Number of the episode in the database. None if it has not run.
+        episode: Row number of the episode in the database. None if the episode has not run.
         kind: Outcome of the episode, a key of OUTCOMES.
         phase: How far the robot got (see `phase_of`), a key of PHASES. The page shows it only for failures.
         stress: Kind and level of the episode's stress, such as `push 2`. Empty without stress.
@@ -92,8 +92,8 @@ class Grid:
 
     Attributes:
         task: Name of the task.
-        seeds: All seeds. Those with the most failures come first.
-        rows: For each setting's label, the episodes by seed.
+        seeds: All seeds. The seeds with the most failures come first.
+        rows: The episodes of each setting, by the setting's label and then by seed.
         failed: Number of failed episodes.
         total: Number of all episodes, also those that have not run.
     """
@@ -106,10 +106,10 @@ class Grid:
 
 
 def cells_of(rows: Sequence[Any], baseline: str, settings: Mapping[str, Setting]) -> list[Cell]:
-    """Compare the outcome of every episode with the baseline's.
+    """Return a cell for every episode. Its kind compares the episode's outcome with the baseline's outcome.
 
     Args:
-        rows: Rows of `outcomes`.
+        rows: Rows of the result of `outcomes`, one per episode.
         baseline: Label of the baseline.
         settings: The settings by label.
     """
@@ -131,8 +131,8 @@ def _kind(row: Any, baseline: bool | None) -> str:
     """Classify an episode's outcome: success, failure, won or lost (against the baseline), error or missing.
 
     Args:
-        row: The episode, a row of `outcomes`.
-        baseline: Whether the baseline solved the same episode; None if the baseline has no result.
+        row: The episode, a row of the result of `outcomes`.
+        baseline: Whether the baseline solved the same task and seed. None if the baseline has no result.
     """
     if row.episode is None:
         return ERROR if row.failed else MISSING
@@ -142,7 +142,7 @@ def _kind(row: Any, baseline: bool | None) -> str:
 
 
 def grids_of(cells: Sequence[Cell]) -> list[Grid]:
-    """Arrange episodes by task. The tasks that fail most often come first."""
+    """Arrange episodes by task. The tasks with the most failures come first."""
     tasks: dict[str, list[Cell]] = defaultdict(list)
     for cell in cells:
         tasks[cell.task].append(cell)
@@ -162,7 +162,7 @@ def clusters_of(cells: Sequence[Cell]) -> list[tuple[list[Cell], int]]:
     """Group failures by task, setting and phase, the largest group first.
 
     Returns:
-        Each group, with the number of episodes of its task and setting that have run.
+        Pairs of a group of failures, and the number of all episodes of the same task and setting that have run.
     """
     groups: dict[tuple[str, ...], list[Cell]] = defaultdict(list)
     ran: Counter[tuple[str, str]] = Counter()

@@ -27,7 +27,7 @@ from kerv_cli.lab.database import Database
 MOST_EPISODES = 400
 """Largest number of episodes that get a page."""
 MOST_FILM_BYTES = 8_000_000
-"""Films are left out after this many bytes."""
+"""Once the exported films have this many bytes in all, further films are left out."""
 
 
 def export_board(
@@ -36,18 +36,18 @@ def export_board(
     folder: Path,
     advance: Callable[[int, int, str], None] = lambda done, total, text: None,
 ) -> list[Path]:
-    """Write the pages of a board into a folder, and return the files, `index.html` first.
+    """Write the pages of a board into a folder, and return the paths of the files, `index.html` first.
 
     Args:
         database: The database.
-        names: Ids of the runs to export. Empty: all runs.
+        names: Ids of the runs to export. If empty, all runs are exported.
         folder: An empty folder.
         advance: Called before each page, with the number of finished pages, the number of all pages that are known so
             far, and the page's address.
 
     Raises:
         KervError: A page cannot be shown.
-        StorageError: The disk is full or not writable.
+        OSError: The disk is full or not writable.
     """
     app = make_app(database)
     app.state.only, app.state.live = frozenset(names), False
@@ -75,7 +75,7 @@ def file_of(address: str) -> str:
 
 
 def _asked(app: Starlette, address: str) -> tuple[int, str, bytes]:
-    """Return status, media type and content of the app's answer to a GET."""
+    """Send a GET request to the app. Return status, media type and content of the answer."""
     parts = urlsplit(address)
     sent: list[Any] = []
 
@@ -143,13 +143,16 @@ def _filled(app: Starlette, address: str, text: str) -> str:
 
 
 def _plain(address: str, link: str) -> str:
-    """Return the address that a link on a page leads to, without query. A frame of a film stands for the film."""
+    """Return the address that a link on a page leads to, without query.
+
+    For a frame of a film, return the address of the whole film.
+    """
     path = urlsplit(urljoin(address, link)).path
     return re.sub(r"^(/episodes/\d+)/frames/\d+$", r"\1/film.gif", path)
 
 
 def _links(address: str, text: str) -> list[str]:
-    """Return the addresses that a page links to, each once."""
+    """Return the addresses of all links, scripts and images of a page, each once."""
     found = re.findall(r'<(?:a|link|script|img)\b[^>]*?\b(?:href|src)="(?!data:)([^"?#][^"]*)"', text)
     return list(dict.fromkeys(_plain(address, html.unescape(one)) for one in found))
 

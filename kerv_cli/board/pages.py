@@ -28,12 +28,12 @@ TEMPLATES = Environment(
 )
 
 CONTENT_POLICY = "content-security-policy"
-"""Header that says what a page may load and run."""
+"""HTTP header that says what a page may load and run."""
 _OWN_CONTENT = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
     "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
-"""The policy of the board's pages: files of the board alone. No page contains a script or a style."""
+"""Content security policy of the board's pages. They load only the board's files, and no inline script or style."""
 
 
 def page_of(run: str) -> str:
@@ -56,10 +56,10 @@ def database_of(request: Request) -> Database:
 
 
 def refreshed(page: Callable[[Request, str, bool], Response]) -> Callable[[Request], Response]:
-    """Decorate the function of a page that the browser reloads again and again.
+    """Decorate a function that makes a page which the browser asks for again and again.
 
-    The page is made only if the database has changed since the last time. The function also gets the database's
-    version, and whether any command is running.
+    The function is called only if the database has changed since the browser last asked. Its further arguments are the
+    version of the database, and whether any command is running.
     """
 
     @functools.wraps(page)
@@ -76,8 +76,8 @@ def render(request: Request, template: str, status: int = 200, **values: Any) ->
     """Return a page.
 
     Args:
-        request: The request. Templates can read it, for example `request.url.path`. Its app's `state.live` says whether
-            to show what works only with the server, such as forms.
+        request: The request. Templates can read it, for example `request.url.path`. `request.app.state.live` says
+            whether to show what works only with the server, such as forms.
         template: File in `templates/`.
         status: HTTP status.
         **values: Values that the template shows. They are escaped.

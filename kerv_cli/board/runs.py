@@ -30,7 +30,7 @@ STATES: dict[str, Callable[[RunEntry], bool]] = {
     "complete": lambda run: run.state == "complete",
     "unfinished": lambda run: run.state != "complete" and not run.is_running,
 }
-"""Choices of the filter by state."""
+"""For each choice of the filter by state, the function that says whether a run is shown."""
 ORDERS: dict[str, Callable[[RunEntry], object]] = {
     "run": lambda run: run.id,
     "state": lambda run: (not run.is_running, run.state == "complete", run.state),
@@ -39,16 +39,16 @@ ORDERS: dict[str, Callable[[RunEntry], object]] = {
     "methods": lambda run: run.methods,
     "tasks": lambda run: run.tasks,
 }
-"""Columns by which the table can be sorted. A minus before the name reverses the order."""
+"""Columns by which the table can be sorted, with the sort key of a run. A minus before the name reverses the order."""
 _SHARE = 0.01
-"""Largest share of each core's time for refreshing the page of a running study, so that its times are not disturbed."""
+"""Largest share of all cores' time for refreshing a running study's page, so that measured times are not disturbed."""
 _SECONDS = 5.0
-"""Shortest time between two refreshes."""
+"""Shortest time between two refreshes of a study's tables, in seconds."""
 
 
 @refreshed
 def show_runs(request: Request, version: str, is_live: bool) -> Response:
-    """Show studies, artifacts and unfinished commands. What is running comes first, unless the user sorts the page."""
+    """Show studies, artifacts and unfinished commands. Running ones come first, unless the user sorts the table."""
     asked = {name: request.query_params.get(name, "") for name in ("kind", "state", "text", "sort")}
     only = request.app.state.only
     every = [run for run in find_runs(database_of(request)) if not only or run.id in only]
@@ -101,8 +101,8 @@ def _parts(database: Database, name: str, version: str, is_running: bool) -> tup
         database: The database.
         name: Name of the study.
         version: `Study.version` of the study. A study is read again only if its version has changed.
-        is_running: Whether the study is running. Then a cost model does not estimate its speeds, because that would
-            slow the study down.
+        is_running: Whether the study is running. If so, the report has no speeds from a cost model, because computing
+            them would slow the study down.
     """
     from kerv_cli.report.report import Report, study_parts  # imports Altair, which takes a second
     from kerv_cli.report.reprice import own_prices
@@ -165,7 +165,7 @@ def show_tables(request: Request) -> Response:
 
 
 def send_library(request: Request) -> Response:
-    """Send the library that draws charts."""
+    """Send the JavaScript library that draws charts."""
     from kerv_cli.report.plots import library
 
     return Response(library(), media_type="text/javascript", headers={"cache-control": "max-age=86400"})
@@ -197,7 +197,7 @@ def show_artifact(request: Request, version: str, is_live: bool) -> Response:
 
 
 def _curves(run: RunEntry) -> dict[str, object] | None:
-    """Return a training's curves as a Vega-Lite chart. None for other artifacts, and before the second validation."""
+    """Return the curves of a training as a Vega-Lite chart. None without training, or before the second validation."""
     from kerv_cli.report.plots import curves_figure, read_log
 
     try:
