@@ -33,15 +33,15 @@ from kerv_cli.lab.runs import COMPLETE, RUNNING, RunRow, forget, interrupted, ru
 from kerv_cli.lab.store import IMPORT, ROLLOUT, SWEEP, Study
 
 LOG, WEIGHTS = "log.csv", "model.safetensors"
-"""Names of a training's files: validation results, weights."""
+"""Names of the files that a training writes: the log of its validations, and the weights."""
 LAST = "last"
-"""Stands for the newest entry, as an argument of commands."""
+"""Argument of commands that stands for the newest entry."""
 _STUDIES = (SWEEP, ROLLOUT, IMPORT)
 _STATES = ("complete", "begun", "damaged", "step ", "running", "interrupted", "failed")
 LABELS = ("tag", "note")
-"""Kinds of labels. `tag` holds words, separated by commas; `note` is free text."""
+"""Kinds of labels that people give to a run. `tag` is a list of words, separated by commas. `note` is free text."""
 _ABOUT = "labels of "
-"""Beginning of the key of a run's labels in the table `about`. There is a row for each run that has any."""
+"""Beginning of keys in the table `about`. The row with the key `labels of ID` holds the labels of the run ID."""
 _FILTERS = ("kind", "method", "task", "state", "since", "tag")
 
 
@@ -57,20 +57,20 @@ class RunEntry:
     Attributes:
         id: Name by which commands find the entry.
         kind: sweep, rollout, import, or a kind of artifact.
-        folder: Folder of its files.
+        folder: Folder of the entry's files.
         started: Start time in UTC (ISO 8601). For an artifact, the time when its newest file changed.
         state: For example `complete`, `interrupted, 2 of 6 episodes`, `step 300 of 600`, `begun` or `damaged`.
-        methods: Decoding methods of its settings. For an artifact, its kind.
-        tasks: Names of its tasks.
-        episodes: Number of its stored episodes.
+        methods: Decoding methods of the study's settings. For an artifact, only its kind.
+        tasks: Names of the entry's tasks.
+        episodes: Number of stored episodes.
         total: Number of episodes or training steps that were planned. 0 if unknown.
         done: Number of planned episodes or training steps that are finished.
-        left: While it runs, the estimated remaining time, such as `about 3 min left`.
+        left: Estimated remaining time, such as `about 3 min left`. Empty if unknown, or if the entry is not running.
         message: Error message of the newest command that makes the entry. Empty if that command had no error.
         figures: Main results of the entry by name, such as the success rate.
-        command: Command-line arguments (without `kerv`) that made it. Empty if unknown.
-        sha256: Hash by which other artifacts refer to it.
-        made_from: Hashes of the artifacts that it was made from, by kind. If settings of a study use different
+        command: Command-line arguments (without `kerv`) that made the entry. Empty if unknown.
+        sha256: Hash by which other entries refer to this artifact.
+        made_from: Hashes of the artifacts that the entry was made from, by kind. If settings of a study use different
             artifacts of a kind, the second and later artifacts have the key `KIND of LABEL`, with the setting's label.
         labels: Texts that people wrote about the entry, with the keys `tag` and `note`.
     """
@@ -95,7 +95,7 @@ class RunEntry:
 
     @property
     def tags(self) -> list[str]:
-        """The words of its label `tag`."""
+        """The words of the entry's label `tag`."""
         return list(filter(None, self.labels.get("tag", "").split(",")))
 
     @property
@@ -156,7 +156,7 @@ def _with_command(entry: RunEntry, row: RunRow, is_finished: bool) -> RunEntry:
     Args:
         entry: The entry, as its rows and files describe it.
         row: The command.
-        is_finished: Whether the same command has finished once. Then a failed repetition leaves the artifact complete.
+        is_finished: Whether the same command has finished before. Then a failed repetition keeps the artifact complete.
     """
     entry, is_running = replace(entry, command=row.command), row.status == RUNNING
     is_repeat = is_finished and entry.state == COMPLETE
@@ -207,9 +207,9 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
 
     Args:
         runs: Entries to choose from.
-        filters: The value of each filter, by the filter's name. `kind` is a whole kind. `method`, `task` and `tag`
+        filters: The value of each filter, by the filter's name. `kind` is the exact kind. `method`, `task` and `tag`
             are names, or patterns such as `drawer*`. `state` is the beginning of a state, and `since` the earliest
-            start (ISO 8601).
+            start time (ISO 8601).
 
     Raises:
         UnknownName: A filter, kind or state does not exist.
@@ -391,7 +391,7 @@ def disk_bytes(folder: Path) -> int:
 
 
 def labels_in(database: Database) -> dict[str, dict[str, str]]:
-    """Return the labels of all runs that have any, by the id of the run."""
+    """Return the labels of each run that has labels, by the id of the run."""
     rows = sa.select(ABOUT).where(ABOUT.c.key.startswith(_ABOUT))
     with database.reading() as connection, database.checking("a label"):
         return {row.key.removeprefix(_ABOUT): json.loads(row.value) for row in connection.execute(rows)}
@@ -441,14 +441,16 @@ def remove(run: RunEntry, database: Database) -> None:
 
 
 def plan_of(run: RunEntry, database: Database) -> Study:
-    """Plan to run a sweep or rollout again. If an earlier repetition was interrupted, plan the rest of that repetition.
+    """Return a study that runs a sweep or rollout again.
+
+    If an earlier repetition was interrupted, the study consists of the rest of that repetition.
 
     Args:
         run: The sweep or rollout to repeat.
         database: The database that has the sweep or rollout.
 
     Raises:
-        CheckpointError: The weights or data of the run have changed since.
+        CheckpointError: The weights or data that the run used have changed since the run.
         UsageError: A setting cannot run.
     """
     from kerv_cli.lab.study import new_name  # imports torch, which listing runs does not need

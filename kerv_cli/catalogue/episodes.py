@@ -26,12 +26,12 @@ def outcomes(store: Study, task: str = "", seed: int | None = None) -> list[Any]
 
     Args:
         store: The study.
-        task: Only episodes of this task. Empty: all.
-        seed: Only episodes of this seed. None: all.
+        task: Task of the episodes. If empty, episodes of all tasks are returned.
+        seed: Seed of the episodes. If None, episodes of all seeds are returned.
 
     Returns:
-        Rows with the columns `label`, `task`, `seed`, `episode` (row number; None if it has not run), `success`,
-        `closest_approach`, `object_moved`, `failed` (whether the last attempt to run it raised an error).
+        Rows with the columns `label`, `task`, `seed`, `episode` (row number; None if the episode has not run),
+        `success`, `closest_approach`, `object_moved`, `failed` (whether the last attempt to run it raised an error).
     """
     with store.database.reading() as connection:
         measures = {one.name: one for one in measures_in(connection)}
@@ -58,8 +58,8 @@ class FoundEpisode:
         id: Row number of the episode.
         store: The study.
         episode: Setting, task, seed and repeat.
-        row: Columns of the table `episodes`, without `decode_seconds`, and columns of the episode's setting.
-        about: Machine and versions that ran it.
+        row: The episode's row, by column: setting, study, task, seed, repeat, block, start time and results.
+        about: Machine and software versions that ran the episode.
         earlier: Seeds that must run before this episode, in this order, so that it gives the same tokens again. Empty
             unless the setting's skip rule adapts from episode to episode.
     """

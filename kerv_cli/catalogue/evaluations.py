@@ -1,7 +1,7 @@
 """Import evaluations that vla-eval ran. They become one study, with one setting per imported path.
 
-A vla-eval recording is a SQLite file. If a kerv server decoded the episodes, their decodes are imported too
-(`read_served`). For other servers only success and number of steps are known.
+A vla-eval recording is a SQLite file. If a kerv server decoded the episodes, their decodes are imported, too
+(`read_served`). For episodes of other servers, only success, number of steps and wall time are known.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class RecordedEpisode:
         seed: Seed of the initial state. It equals `index` if the benchmark does not name a seed.
         success: Whether the task was solved.
         steps: Number of control steps.
-        seconds: Wall time.
+        seconds: Wall time in seconds.
         id: The episode's id in the evaluation program.
         start: Numbers that describe the initial state.
         reason: The error that ended the episode. Empty if there was none.
@@ -80,7 +80,7 @@ class Evaluation:
         config: Settings of the benchmark.
         server: What the model server said about itself.
         episodes: The recorded episodes.
-        planned: Number of episodes in the recording's work queue. 0 if it has none.
+        planned: Number of episodes in the recording's work queue. 0 if the recording has no queue.
     """
 
     source: Path
@@ -111,9 +111,9 @@ def import_evaluations(
     Args:
         database: The database to write to.
         paths: One path per setting: a vla-eval recording, or a folder of recordings.
-        name: Name of the study. Empty: made from the benchmarks' names.
-        labels: A label for each path. Empty: the servers' names.
-        baseline: Label of the baseline. Empty: `ar` if there is such a label, or else the first label.
+        name: Name of the study. If empty, it is made from the names of the benchmarks.
+        labels: A label for each path. If empty, the labels are the names of the servers.
+        baseline: Label of the baseline. If empty, it is `ar` if there is such a label, or else the first label.
         words: Command-line arguments (without `kerv`) of the import.
 
     Returns:
@@ -208,7 +208,7 @@ def labelled(recordings: Sequence[list[Evaluation]], labels: Sequence[str] = ())
 
     Args:
         recordings: The evaluations in each recording.
-        labels: A label for each recording. Empty: the names of the model servers.
+        labels: A label for each recording. If empty, the labels are the names of the model servers.
 
     Returns:
         The evaluations by label.
@@ -268,7 +268,7 @@ def _episodes(setting: Setting, one: Evaluation, several: bool) -> Iterator[tupl
     Args:
         setting: The setting of the evaluation.
         one: The evaluation.
-        several: Whether several benchmarks are imported. The name of each then comes before its tasks' names.
+        several: Whether several benchmarks are imported. If so, each task's name begins with its benchmark's name.
     """
     each = int(one.config.get("episodes_per_task") or 0)
     by_task: dict[str, list[RecordedEpisode]] = {}
@@ -295,7 +295,8 @@ def _notes(label: str, one: Evaluation) -> Iterator[str]:
 def _settings(first: Evaluation) -> dict[str, Any]:
     """Return the rollout settings of the evaluation, as nested plain values.
 
-    A kerv server sends its settings. For any other server they are the defaults, with the server's name as method.
+    A kerv server sends its settings. For any other server, the result is the default settings, with the server's name
+    as the method.
     """
     stored = first.facts.get("settings")
     plain = asdict(RolloutSettings()) | {"method": first.name}
@@ -328,10 +329,10 @@ def _identity(evaluations: Sequence[Evaluation]) -> dict[str, str]:
 def _imported(results: Path, episode: Episode, one: Evaluation, recorded: RecordedEpisode) -> ImportedEpisode:
     """Return an episode for the database, with its decodes if kerv served it.
 
-    The settings were not run alternately. So each evaluation is a block (episodes that one process ran) of its own.
+    In vla-eval, settings do not take turns. So each evaluation is a block (episodes that one process ran) of its own.
 
     Args:
-        results: The results folder, which holds the served episodes.
+        results: The results folder. It holds the episodes that kerv served.
         episode: Setting, task, seed and repeat in the study.
         one: The evaluation.
         recorded: The recorded result.

@@ -29,14 +29,14 @@ _FURTHER = ("order", "started")
 _ROW = (*map(attrgetter("name"), MEASURES), *_FURTHER)
 
 MOST_STEPS = 20_000_000
-"""Limit on steps of SQLite's virtual machine per connection, about a second. It grows by STEPS_PER_BYTE per byte."""
+"""Instructions that SQLite may execute per connection (about 1 s), plus STEPS_PER_BYTE for each byte of the file."""
 STEPS_PER_BYTE = 20
 _EVERY = 10_000
 
 
 Found: TypeAlias = tuple[Study, Iterator[ImportedEpisode], tuple[str, ...]]
-"""A study that can be imported, with the list of all planned episodes; its episodes that were run, with their results;
-and the command-line arguments (without `kerv`) that ran it, empty if unknown."""
+"""Three values. First, a study to import, with all its planned episodes. Second, the episodes that were run, with their
+results. Third, the command-line arguments (without `kerv`) that ran the study. They are empty if unknown."""
 
 
 def import_databases(database: Database, files: Sequence[Path], name: str = "") -> tuple[list[str], list[str]]:
@@ -47,7 +47,7 @@ def import_databases(database: Database, files: Sequence[Path], name: str = "") 
     Args:
         database: The database to copy to.
         files: Database files to copy from.
-        name: New name of the study. Each file must then hold exactly one study. Empty: keep the names.
+        name: New name of the study. Each file must then hold exactly one study. If empty, studies keep their names.
 
     Returns:
         Names of the imported studies, and a line of text about each study that was left out.
@@ -74,7 +74,7 @@ def import_databases(database: Database, files: Sequence[Path], name: str = "") 
 
 
 def database_in(path: Path) -> Path | None:
-    """Return the database file: `path` itself, or kerv.db in the folder `path`. None if that file is no database.
+    """Return the database file: a file `path` ending in .db, or kerv.db in a folder `path`. None if there is neither.
 
     Raises:
         UsageError: The path does not exist.
@@ -121,8 +121,8 @@ def _in_database(path: Path, database: Database, name: str, stack: contextlib.Ex
     Args:
         path: The file to read. It stays open until `stack` is closed.
         database: The database to import the studies into.
-        name: Name of each study there. Empty: its own name.
-        stack: Closes the file.
+        name: New name of each study. If empty, each study keeps its name.
+        stack: The file is closed when this stack is closed.
 
     Raises:
         CheckpointError: The file is damaged, or was written by a newer version of kerv.
@@ -146,10 +146,10 @@ def _stored(connection: sa.Connection, path: Path, row: Any, database: Database,
         path: File of that database, for error messages.
         row: The row.
         database: The database to import the study into.
-        name: Name of the study there. Empty: its own name.
+        name: New name of the study. If empty, the study keeps its name.
 
     Returns:
-        The study, its stored episodes and its command line, see `Found`.
+        The study, its episodes that were run, and its command-line arguments; see `Found`.
     """
     settings, episodes = stored_settings(connection, row.id)
     study = Study(database, name or row.name, row.kind, tuple(settings.values()), episodes, **row.about)
@@ -165,7 +165,7 @@ def _stored_episodes(connection: sa.Connection, path: Path, settings: dict[int, 
     Args:
         connection: The database.
         path: File of that database, for error messages.
-        settings: The settings by their id in that database.
+        settings: The settings, by their row number in that database.
 
     Raises:
         CheckpointError: The file is damaged, or the decodes of an episode are too large.
@@ -203,7 +203,7 @@ def export_database(study: Study, folder: Path) -> Path:
     """Write a study into a new kerv.db in a folder, and return that file's path. An existing kerv.db is replaced.
 
     Raises:
-        UsageError: The folder contains other files.
+        UsageError: The folder contains other files than kerv.db.
         StorageError: The disk is full or not writable.
     """
 
