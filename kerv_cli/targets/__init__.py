@@ -1,4 +1,4 @@
-"""Register kerv's own families of targets: compact, grown and OpenVLA. Each function imports what it calls."""
+"""Register kerv's own families of targets: compact, grown and OpenVLA. Each function imports its module when called."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from kerv_cli.base.registry import Part
 
 @dataclass(frozen=True, kw_only=True)
 class TargetPart(Part):
-    """A family of targets. The decorated function loads a target from (folder, description, device, dtype).
+    """A family of targets. It decorates the function (folder, description, device, dtype) that loads a target.
 
     Args:
-        importer: Function that makes a target of this family from the settings of `kerv build target`. None: targets of
-            this family are made by training.
-        check_weights: Function (folder, description) that checks weights stored outside the target's folder. None: the
-            weights are in the target's folder.
-        images_alone: Whether targets of this family read images, but no state of the robot.
+        importer: Function that makes a target of this family from the settings of `kerv build target`. None if
+            targets of this family are made only by training.
+        check_weights: Function (folder, description) that checks weights stored outside the target's folder. None if
+            the weights are in the target's folder.
+        images_alone: Whether targets of this family read only images, and no proprioception or state.
     """
 
     kind = "target"

@@ -2,7 +2,8 @@
 
 A slot of the cache holds the keys and values of one token.
 
-Shapes: B batch, T new tokens, S cached tokens, A heads (of keys and values), C channels of a head.
+Shapes: B batch, T new tokens, S cached tokens, A attention heads, C channels of a head. In a cache, A counts only the
+heads of keys and values.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from kerv_cli.engine.transfer import upload
 
 
 class Cache:
-    """Keys and values of every layer and token.
+    """The keys and values of all tokens that a trunk has processed, for every layer.
 
     Args:
         layers: Number of layers.
@@ -35,8 +36,8 @@ class Cache:
         buffer: (layers, 2, B, A, slots, C) keys and values. A fixed cache has a spare slot after its capacity.
         layers: (2, B, A, slots, C) per layer, views of the buffer.
         length: Number of cached tokens. They are in the first slots.
-        copied: Number of slots, from the first on, whose `copies` equal the buffer. The number may exceed `length`,
-            because later slots are overwritten before they are read.
+        copied: Number of slots, from the first on, whose content is already in the memory that `copies` returns. It may
+            exceed `length`. Then only the first `length` slots count.
     """
 
     def __init__(
@@ -53,7 +54,7 @@ class Cache:
     def copies(self, width: int) -> tuple[np.ndarray, np.ndarray, int]:
         """Return the memory in which compiled programs keep copies of keys and values.
 
-        The copies are stored in panels, which are blocks of `width` slots (keys) or `width` channels (values).
+        The copies are stored in panels. A panel of keys has `width` slots, a panel of values has `width` channels.
 
         Returns:
             The keys (layers, B · A, panels, C, width), the values (layers, B · A, panels, slots, width), and the number
@@ -81,9 +82,9 @@ class Cache:
         self.length, self.copied = start + n, min(self.copied, start)
 
     def next_slots(self, tokens: int) -> Slots:
-        """Return the slots in which the next `tokens` new tokens go, right after the cached tokens.
+        """Return the slots for the next `tokens` tokens, right after the cached tokens.
 
-        The result is a slice. For a cache of fixed shapes it is a tensor of indices (tokens,).
+        The result is a slice. If the cache has fixed shapes, it is a tensor of indices (tokens,).
         """
         start, stop = self.length, self.length + tokens
         self.copied = min(self.copied, start)
@@ -91,21 +92,22 @@ class Cache:
 
 
 Slots = slice | Tensor | None
-"""Slots of a cache that a forward writes: a slice, or for a cache of fixed shapes indices (T,). None: no cache."""
+"""Slots of a cache that a forward writes to: a slice, or indices (T,) if the cache has fixed shapes. None if there is
+no cache."""
 Rotation = tuple[Tensor, Tensor]
 """Cosines and sines of the rotary embedding at the positions of T tokens, see `rotate`."""
 
 
 def attend(q: Tensor, k: Tensor, v: Tensor, cache: Tensor | None, slots: Slots, mask: Tensor | None) -> Tensor:
-    """Return the attention's result (B, T, A · C) of new tokens, and write their keys and values to the cache.
+    """Return the attention's output (B, T, A · C) for T new tokens, and write their keys and values to the cache.
 
     Args:
         q: (B, A, T, C) queries of A heads.
         k: (B, K, T, C) keys of K heads. If K < A, several query heads share a head of keys.
         v: (B, K, T, C) values of K heads.
-        cache: (2, B, K, slots, C) keys and values of this layer. None: there are no earlier tokens.
+        cache: (2, B, K, slots, C) keys and values of this layer. None if there are no earlier tokens.
         slots: Slots of the new tokens. None if there is no cache.
-        mask: Result of `attention_mask`. None: attention is causal.
+        mask: Result of `attention_mask`. If None, attention is causal.
     """
     causal = mask is None and q.shape[2] > 1
     if cache is not None and isinstance(slots, Tensor):
@@ -126,11 +128,11 @@ def attention_mask(seen: Seen, tokens: int, cache: Cache | None, like: Tensor) -
     """Return the additive attention mask of new tokens: 0 for visible tokens, -inf for hidden tokens.
 
     Args:
-        seen: (T, M) bool, which of the last M tokens each new token attends to: the M − T newest cached tokens, then
-            the T new ones. Each new token attends to all earlier cached tokens. None: attention is causal. A tensor
-            must be on the device of `like`.
+        seen: (T, M) bool, which of the last M tokens each new token attends to. The last M tokens are the M − T newest
+            cached tokens, then the T new tokens. Each new token also attends to all earlier cached tokens. If None,
+            attention is causal. A tensor must be on the device of `like`.
         tokens: T, number of new tokens.
-        cache: Cache of earlier tokens. None: there are none.
+        cache: Cache of earlier tokens. None if there are no earlier tokens.
         like: Tensor whose device and number format the mask gets.
 
     Returns:
@@ -173,7 +175,7 @@ _WARM_UP = 3  # runs before a capture, in which libraries choose kernels and all
 def bucket(tokens: int) -> int:
     """Return the number of tokens of the smallest CUDA graph that can process `tokens` tokens.
 
-    It is a power of two up to 16, then a multiple of 16.
+    This number is a power of two up to 16, and above 16 a multiple of 16.
     """
     if tokens <= 16:
         return 1 << (tokens - 1).bit_length()
@@ -181,18 +183,19 @@ def bucket(tokens: int) -> int:
 
 
 Compute = Callable[[Tensor, Tensor, Cache, Tensor, Tensor], Tensor]
-"""The function that a graph captures, `LayerStack.run_layers`."""
+"""Type of the function that a CUDA graph captures. The function is `LayerStack.run_layers`."""
 
 
 class CapturedCache(Cache):
     """A key/value cache of fixed shapes, with CUDA graphs that run a forward through all layers in one launch.
 
     A graph takes a fixed number of tokens, called its bucket (1, 2, 4, 8, 16, 32, 48, …). A forward of T tokens runs in
-    the smallest bucket that is large enough. Its unused tokens read zeros and write to the spare slot, which no other
-    token attends to. The batch size is 1. On a CPU the same computation runs without graphs, for tests.
+    the smallest bucket that is large enough. The bucket's unused tokens have zeros as input. Their keys and values go
+    to the spare slot, which no other token attends to. The batch size is 1. On a CPU the same computation runs without
+    graphs, for tests.
 
     Attributes:
-        steps: The graphs, by bucket. Empty before the first forward.
+        steps: The graphs, by number of tokens. Empty before the first forward on a GPU.
     """
 
     def __init__(self, layers: int, batch: int, heads: int, capacity: int, channels: int, like: Tensor) -> None:
@@ -248,7 +251,7 @@ class _Step:
         return self.compute(self.x, self.positions, self.cache, self.index, self.mask)
 
     def run(self, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
-        """Copy the inputs to the graph's buffers and replay the graph; arguments as `CapturedCache.run`."""
+        """Copy the inputs to the graph's buffers and replay the graph. `CapturedCache.run` explains the arguments."""
         tokens, start = x.shape[1], self.cache.length
         self.x.zero_()[:, :tokens].copy_(x)
         self.positions[:tokens].copy_(positions)

@@ -27,12 +27,12 @@ WEIGHTS = "model.safetensors"
 FLOAT32, FLOAT16, INT8 = "float32", "float16", "int8"
 """Number formats of stored weights."""
 SCALE = ".scale"
-"""The tensor `<name>.scale` contains the scales of the int8 matrix `<name>`, one per row."""
+"""Suffix of a tensor's name: `<name>.scale` contains the scales of the int8 matrix `<name>`, one per row."""
 
 
 @dataclass(frozen=True)
 class Description:
-    """Fields in the description (`<kind>.json`) of every artifact with weights.
+    """Fields that every description (`<kind>.json`) of an artifact with weights has.
 
     Attributes:
         format: Version of the format, `FORMAT`.
@@ -58,8 +58,8 @@ class TargetDescription(Description):
         cameras: Names of the cameras whose images the target reads.
         words: Vocabulary of instructions.
         provenance: How the target was made.
-        state_range: The 0.1th percentile of each number of the demonstrations' states, then the 99.9th percentile of
-            each. None: not recorded.
+        state_range: The 0.1th percentiles, then the 99.9th percentiles, of the demonstrations' states. Each tuple has
+            one percentile per number of the state. None if the range was not recorded.
     """
 
     family: str
@@ -83,10 +83,10 @@ class TargetDescription(Description):
 
     @property
     def origin(self) -> Mapping[str, Any]:
-        """Identity of the policy whose tokens the target decodes: `sha256` is the hash of the policy's weights.
+        """Identity of the policy whose tokens the target decodes. The key `sha256` holds the hash of its weights.
 
         Usually the policy is the target itself. A grown target (docs/methods.md §0.2) is an enlarged policy, and
-        decodes the tokens of the original policy. Then `base` is the folder of the original policy.
+        decodes the tokens of the original policy. The key `base` then holds the folder of the original policy.
         """
         return self.settings.get("grown") or {"sha256": self.sha256}
 
@@ -127,7 +127,7 @@ class TargetDescription(Description):
         """Check that the target decodes token by token.
 
         Args:
-            what: The setting that requires this, text for the error message.
+            what: The setting that requires decoding token by token, text for the error message.
             why: Why the setting requires this, text for the error message.
 
         Raises:
@@ -146,7 +146,7 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, 
     Args:
         path: The file.
         tensors: The tensors, by name.
-        metadata: Texts to store in the file. None: no texts.
+        metadata: Texts to store in the file, by name. None if there are no texts.
 
     Raises:
         StorageError: The disk is full or read-only, or permission is missing.
@@ -189,9 +189,9 @@ def compact(state: Mapping[str, Tensor], stored: str) -> dict[str, Tensor]:
 
     Args:
         state: The tensors, by name.
-        stored: float32 changes nothing. float16 converts all floats. int8 converts matrices to integers from -127 to
-            127, with a float16 scale per row in `<name>.scale` (the row's largest absolute value / 127), and all other
-            floats to float16.
+        stored: Number format. float32 changes nothing. float16 converts all floats. int8 converts matrices to integers
+            from -127 to 127, and all other floats to float16. Each row of a matrix gets a float16 scale in
+            `<name>.scale`: the row's largest absolute value / 127.
     """
     import torch
 
@@ -210,7 +210,7 @@ def compact(state: Mapping[str, Tensor], stored: str) -> dict[str, Tensor]:
 
 
 def expanded(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Undo `compact`: multiply int8 matrices by their scales, which gives float32. Other tensors stay unchanged."""
+    """Convert int8 matrices that `compact` made back to float32, with their scales. Other tensors stay unchanged."""
     full = {}
     for name, tensor in tensors.items():
         if not (name.endswith(SCALE) and name.removesuffix(SCALE) in tensors):  # a module may have its own `….scale`
@@ -224,8 +224,8 @@ def save_module(
 ) -> str:
     """Write the weights of a module and their description `<kind>.json`. Return the SHA-256 of the weights.
 
-    Both are replaced in one step: a process that is killed leaves the old pair or the new one. Other files in the
-    folder stay.
+    Both files are replaced in one step. If the process is killed, the folder holds either the old pair of files or the
+    new pair. Other files in the folder stay.
 
     Args:
         folder: Folder to write to.
@@ -263,7 +263,7 @@ def target_fields(
     observation: ObservationSpace,
     **others: Any,
 ) -> dict[str, Any]:
-    """Return the description of a target for `save_module`. The arguments are fields of `TargetDescription`."""
+    """Return a target's description, to pass to `save_module`. The arguments are fields of `TargetDescription`."""
     spaces = {"actions": actions.as_dict(), "observation": asdict(observation)}
     empty: dict[str, Any] = {"cameras": [], "words": [], "provenance": {}}
     return {"family": family, "environment": environment, "settings": dict(settings), **spaces, **empty, **others}
@@ -366,8 +366,8 @@ def load_target(folder: Path, device: str = "cpu", dtype: torch.dtype | None = N
 
     Args:
         folder: Folder of the target.
-        device: Device to load it to.
-        dtype: Number format to convert the weights to. None: float32.
+        device: Device to load the target to.
+        dtype: Number format to convert the weights to. If None, it is float32.
 
     Returns:
         The target and its description.

@@ -22,7 +22,7 @@ from kerv_cli.engine.protocol import Cache, Target
 from kerv_cli.worlds.findings import Finding, find, need
 
 TOLERANCE = {torch.float64: 1e-6, torch.float32: 2e-4, torch.bfloat16: 0.2, torch.float16: 0.05}
-"""Largest difference of logits that rounding can cause, in units of their standard deviation, by number format."""
+"""Largest difference of two logits that rounding can cause, in standard deviations of the logits, by number format."""
 MEMBERS = ("actions", "chunk", "cameras", "width", "max_prompt", "device")
 METHODS = ("encode", "embed", "new_cache", "forward", "head")
 TREE = Draft.of([0] * 7, [-1, 0, 0, 1, 1, 2, 4])
@@ -34,7 +34,7 @@ up to rounding."""
 
 @torch.inference_mode()
 def check_target(target: Target, observation: Observation) -> list[Finding]:
-    """Run all checks, and return one finding per check.
+    """Run the checks, and return one finding per check. After a failed check that all later checks need, stop.
 
     Args:
         target: The target.
@@ -49,9 +49,9 @@ def check_target(target: Target, observation: Observation) -> list[Finding]:
 
 
 class Trial:
-    """The checks of one target on one observation.
+    """The checks of one target on one observation. A check that fails raises a KervError.
 
-    Most checks compare hidden states with those from the method `plain`, which runs one causal forward without a cache.
+    Most checks compare hidden states with the result of `plain`, which runs one causal forward without a cache.
 
     Attributes:
         tokens: Action tokens for the checks. Their values do not matter.
@@ -130,7 +130,7 @@ class Trial:
         return self.target.forward(x, torch.arange(first, first + x.shape[1], device=x.device), cache)
 
     def plain(self, tokens: Sequence[int]) -> Tensor:
-        """Return the hidden states (1, P + T, E) of the prompt and tokens, in one forward without a cache."""
+        """Return the hidden states (1, P + T, E) of the prompt and T tokens, from one forward without a cache."""
         return self.append(self.with_prompt(tokens))
 
     def path(self, node: int) -> list[int]:
@@ -140,12 +140,13 @@ class Trial:
     def causality(self) -> Pairs:
         """Check that a token's hidden state does not depend on later tokens.
 
-        Yields the hidden states of four tokens: from a forward without later tokens, and from a forward of all tokens.
+        Yields the hidden states of the prompt and four tokens: from a forward without later tokens, and from a forward
+        of all tokens.
         """
         yield self.plain(self.tokens[:4]), self.plain(self.tokens)[:, : self.length + 4]
 
     def pieces(self) -> Pairs:
-        """Check that tokens get the same hidden states in several forwards with a cache as in one forward."""
+        """Check that several forwards with a cache give tokens the same hidden states as one without a cache."""
         for lengths in ([1] * 6, [1, 5, 3]):
             cache, rest = self.new_cache(), iter(self.tokens)
             self.append(self.prompt, cache)
@@ -165,7 +166,7 @@ class Trial:
         return cache, self.target.forward(x, positions, cache, TREE.visible(1))
 
     def draft_tree(self) -> Pairs:
-        """Check that a node of a draft tree has the same hidden state as in a forward of only its own path.
+        """Check that forwarding a draft tree gives each node the same hidden state as forwarding only the node's path.
 
         The whole tree is forwarded twice. First it follows cached tokens, as in a later round of a decode. Then it
         follows the prompt in one forward, as when the prefill verifies a draft. Yields two pairs per node, one for each
@@ -196,7 +197,7 @@ class Trial:
         yield self.append(self.prompt, cache), self.plain([])
 
     def batch(self) -> Pairs:
-        """Check that two prompts in one batch give the same hidden states as each alone."""
+        """Check that two prompts in one batch give the same hidden states as each prompt alone."""
         prompts = torch.cat([self.prompt, self.prompt.flip(1)])
         for row, prompt in zip(self.append(prompts, self.new_cache(2)), prompts, strict=True):
             yield row[None], self.append(prompt[None])

@@ -4,7 +4,7 @@ It shows how a method behaves at the speed of a larger model (docs/methods.md §
 additional channels that stay zero, additional heads and hidden units whose output weights are zero, and additional
 layers that add nothing. A longer prompt consists of masked tokens, which a prefill computes and drops. The outputs are
 equal except for rounding, but every weight is read and multiplied. The folder of a grown target contains a recipe. The
-weights are made when it is loaded.
+weights are made when the target is loaded.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ STD = 0.02
 
 @dataclass
 class Recipe(GrowSettings):
-    """The content of a grown target's folder: the shape, and the policy that is enlarged.
+    """The recipe in a grown target's folder: the shape of the new trunk, and the policy that is enlarged.
 
     Attributes:
         base: Folder of the policy's target.
@@ -58,7 +58,7 @@ def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
         layers: Number of new layers.
 
     Raises:
-        UsageError: The new shape is smaller, or the channels of a head are no multiple of the old ones.
+        UsageError: The new shape is smaller, or the channels of a new head are no multiple of those of an old head.
     """
     old: list[Any] = [copy.deepcopy(layer).float() for layer in stack.layers]
     stack.compiled = None
@@ -172,7 +172,7 @@ def grow(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
     """Make a grown target by writing its recipe, for `kerv build target grow=SHAPE policy.target=NAME`.
 
     Returns:
-        The target's folder, and numbers to print by name, such as the number of weights.
+        The target's folder, and numbers to print, each with its name, such as the number of weights.
 
     Raises:
         UsageError: There is no such policy, it is not a compact target, or it is larger than the new shape.

@@ -13,13 +13,13 @@ from kerv_cli.base.spaces import ActionSpace
 
 
 def soft_labels(tokens: int, sigma: float) -> Tensor:
-    """Return the probabilities (V, V) that a model should predict. Row i holds those for the true token i.
+    """Return the probabilities (V, V) that a model should predict. Row i is for the case that token i is true.
 
-    A row is a Gaussian around the true token.
+    A row holds the probabilities of all V tokens: a Gaussian around the true token.
 
     Args:
         tokens: V, number of tokens.
-        sigma: Standard deviation in bins. 0 means that only the true token has a probability.
+        sigma: Standard deviation in bins. If 0, the true token has the probability 1.
     """
     bins = torch.arange(tokens, dtype=torch.float32)
     if sigma <= 0:
@@ -30,7 +30,7 @@ def soft_labels(tokens: int, sigma: float) -> Tensor:
 def labels_of(actions: ActionSpace, sigma: float) -> Tensor:
     """Return `soft_labels` for the tokens of an action space.
 
-    Tokens of a code have no distance to each other. So only the true token has a probability, whatever `sigma` is.
+    Tokens of a code have no distance to each other. So the true token has the probability 1, whatever `sigma` is.
     """
     return soft_labels(actions.tokens, sigma if actions.code is None else 0.0)
 
@@ -42,18 +42,18 @@ def token_loss(logits: Tensor, tokens: Tensor, labels: Tensor, counted: Tensor |
         logits: (B, N, V) predictions.
         tokens: (B, N) true tokens.
         labels: (V, V) result of `soft_labels`.
-        counted: (B, N) bool, the tokens to average over. None: all.
+        counted: (B, N) bool, the tokens to average over. If None, average over all tokens.
     """
     losses = -(labels[tokens] * F.log_softmax(logits.float(), -1)).sum(-1)
     return losses.mean() if counted is None else losses[counted].mean()
 
 
 def within_chunk(tokens: Tensor, end: int | None) -> Tensor:
-    """Return which tokens belong to their chunk, (B, N) bool. Tokens after the end token do not.
+    """Return a mask (B, N) bool: whether each token belongs to its chunk. Tokens after the end token do not.
 
     Args:
         tokens: (B, N) tokens.
-        end: The token that ends a chunk. It belongs to the chunk itself. None: all tokens belong to their chunk.
+        end: The token that ends a chunk. It belongs to the chunk itself. If None, all tokens belong to their chunk.
     """
     ends = tokens == (-1 if end is None else end)
     return ends.cumsum(1) - ends.long() == 0

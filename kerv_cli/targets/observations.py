@@ -32,7 +32,7 @@ BATCH = 64
 class Rows:
     """Base class of dataclasses whose fields have one row per sample.
 
-    A field is a tensor or encoded images. The field of the images is None if the samples have none.
+    A field is a tensor or encoded images. The field of the images is None if the samples have no images.
     """
 
     def __len__(self) -> int:
@@ -91,13 +91,15 @@ def read_observations(
 
     Args:
         episode: A stored episode.
-        settings: Shapes of the policy. If it reads images, only control steps with an image count, else every step.
+        settings: Shapes of the policy. If the policy reads images, only control steps with an image are observations.
+            Otherwise every control step is one.
         space: Observation space of the demonstrations.
         words: The policy's vocabulary.
         chosen: Which of these observations to return, as indices or a slice.
 
     Raises:
         CheckpointError: The images have a different size than the policy takes.
+        UsageError: The instruction has more words than the policy takes.
     """
     sees, frames = settings.observation == "vision", None
     steps = observed_steps(episode, sees)[chosen]
@@ -114,7 +116,7 @@ def read_observations(
 def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarray:
     """Return the expert's next H actions at each of several control steps, without added noise.
 
-    A chunk that begins near the end includes actions that were recorded after the success.
+    A chunk that begins near the episode's end includes actions that were recorded after the success.
 
     Args:
         episode: A stored episode.
@@ -234,7 +236,8 @@ S = TypeVar("S", bound=Rows)
 def split(samples: S, share: float) -> tuple[S, S]:
     """Split samples into training and held-out samples. All samples of an episode go to the same part.
 
-    Every k-th episode is held out, so that both parts contain each task, with and without perturbations.
+    Every k-th episode is held out (k is about 1 / share), so that both parts contain each task, with and without
+    perturbations.
 
     Args:
         samples: Samples with a tensor `episodes`, the index of each sample's episode.

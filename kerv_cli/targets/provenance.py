@@ -73,7 +73,7 @@ def device_name(device: str) -> str:
 
 @functools.cache
 def git_commit(folder: Path = _HERE) -> str:
-    """Return the git commit of kerv, with `+changes` if tracked files of the whole checkout were modified.
+    """Return the hash of kerv's git commit, followed by `+changes` if any tracked file in the checkout was modified.
 
     Args:
         folder: A folder of kerv's source code. If the folder is not part of a checkout, the result is `none`.

@@ -39,8 +39,8 @@ class TargetSettings:
             prefix: Start of the settings' names in error messages, such as `target.`.
 
         Raises:
-            UsageError: The width is no multiple of twice the heads, or the image no multiple of 8 times the grid. Or a
-                parallel target has chunks of different lengths.
+            UsageError: The width is no multiple of twice the number of heads, or the image size is no multiple of
+                8 · `grid`. Or a parallel target has a code whose chunks differ in length.
         """
         if self.parallel and self.code != "bins":
             raise UsageError(f"{prefix}parallel=true: chunks of {prefix}code={self.code} differ in length; use bins")

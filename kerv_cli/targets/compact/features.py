@@ -1,7 +1,7 @@
 """Features of what a compact policy observes: words, the scene, the privileged state and images (docs/methods.md §0.1).
 
-A place is a position that the task is about: of the object or of the goal, for example. The privileged state is what
-only the simulator knows. Features of both are scaled to about 1.
+A place is a position that matters to the task, such as the position of the object or of the goal. The privileged state
+holds numbers that only the simulator knows. The features of places and of the privileged state are scaled to about 1.
 
 The vision encoder is a small convolutional network that turns an image into vision tokens and image points. The vision
 tokens are a coarse grid for the trunk. The image points are found by spatial soft-argmax (Finn et al. 2016) on the
@@ -51,7 +51,7 @@ def relative(vector: Tensor) -> Tensor:
 
 
 def hand_features(proprioception: Tensor, centre: Tensor) -> Tensor:
-    """Return the proprioception (B, p), in which (position − centre) / 0.1 m replaces the end effector's position.
+    """Return the proprioception (B, p), with the end effector's position replaced by (position − centre) / 0.1 m.
 
     Args:
         proprioception: (B, p), its first three numbers are the end effector's position in metres.
@@ -63,8 +63,9 @@ def hand_features(proprioception: Tensor, centre: Tensor) -> Tensor:
 def scene_features(proprioception: Tensor, places: Tensor, centre: Tensor) -> Tensor:
     """Return the scene features (B, p + 15 K − 6).
 
-    They hold `hand_features` (p numbers), the K places relative to the centre (3 K), and 2 K − 1 vectors: from the hand
-    to each place, and from each place to the next. `relative` turns each vector into 6 numbers.
+    They hold `hand_features` (p numbers), the K places relative to the centre, divided by 0.1 m (3 K numbers), and
+    2 K − 1 vectors: from the hand to each place, and from each place to the next. `relative` turns each vector into 6
+    numbers.
 
     Args:
         proprioception: (B, p).
@@ -84,13 +85,14 @@ def scene_width(space: ObservationSpace) -> int:
 def privileged_features(proprioception: Tensor, states: Tensor, space: ObservationSpace) -> Tensor:
     """Return features (B, `privileged_width`) for a policy that reads the simulator's state.
 
-    They hold the state's extra numbers, its velocities, and two vectors for each extra place: from the hand to the
-    extra place, and from there to the last of `space.places`. `relative` turns each vector into 6 numbers.
+    They hold the state's extra numbers, its velocities (the change in a control step / 0.01, clamped to ±3), and two
+    vectors for each extra place: from the hand to the extra place, and from the extra place to the last of
+    `space.places`. `relative` turns each vector into 6 numbers.
 
     Args:
         proprioception: (B, p).
         states: (B, s) privileged states.
-        space: Says where the state has its extra numbers, velocities and extra places.
+        space: Observation space. It says where a state holds extra numbers, the previous state and extra places.
     """
     hand, last = proprioception[:, :3], position(states, space.places[-1])
     parts = [states[:, list(space.extra)]]
@@ -134,7 +136,7 @@ class WordTokenizer:
 
     @classmethod
     def build(cls, sentences: Iterable[str]) -> WordTokenizer:
-        """Return a tokenizer for all lower-case words of the sentences, in alphabetical order."""
+        """Return a tokenizer that knows all words of the sentences, in lower case and in alphabetical order."""
         return cls(tuple(sorted({word for s in sentences for word in s.lower().split()})))
 
     @property
@@ -165,7 +167,7 @@ class Residual(nn.Module):
     Args:
         channels: C, number of channels.
         norm: `group` normalises eight groups of channels. `instance` normalises each channel by itself, which makes the
-            output least sensitive to light and colour. Both have weights of the same shapes.
+            output least sensitive to light and colour. Both norms have weights of the same shapes.
     """
 
     def __init__(self, channels: int, norm: str = "group") -> None:
@@ -209,7 +211,7 @@ class VisionEncoder(Compilable):
         self.register_buffer("columns", torch.linspace(-1, 1, size // 2), persistent=False)
 
     def new_program(self) -> Callable[[Tensor], list[Tensor]] | None:
-        """Return this encoder for single images, in ONNX Runtime. None if the weights are not float32."""
+        """Return this encoder as a function of one image, in ONNX Runtime. None if the weights are not float32."""
         return compiled_encoder(self, 2 * len(self.columns)) if self.columns.dtype == torch.float32 else None
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -244,18 +246,18 @@ class VisionEncoder(Compilable):
 
 
 def compiled_encoder(encoder: nn.Module, size: int) -> Callable[[Tensor], list[Tensor]]:
-    """Return a vision encoder for one image, in ONNX Runtime. For small convolutions on a CPU it is faster than torch.
+    """Return a function that runs a vision encoder on one image in ONNX Runtime, which is faster on a CPU than torch.
 
-    torch calls oneDNN for each convolution, and a call takes 19 µs before it computes anything. The encoder of the
+    torch calls oneDNN for each convolution, and each call takes 19 µs before it computes anything. The encoder of the
     smallest drafter has eleven convolutions. Measured on an AMD EPYC, 96 × 96 pixels, 8 channels: 607 µs in torch,
-    270 µs here. ONNX Runtime uses as many threads as torch has at the time of this call.
+    270 µs in ONNX Runtime. ONNX Runtime uses as many threads as torch has at the time of this call.
 
     Args:
         encoder: Maps images (1, 3, size, size) uint8 to vision tokens (1, grid², E) and K image points (1, 2K).
         size: Pixels per side of an image.
 
     Returns:
-        A function that computes the same.
+        A function that maps such an image to a list of the two outputs of `encoder`.
     """
     import onnxruntime  # needed only on a CPU
 

@@ -35,9 +35,9 @@ from kerv_cli.targets.compact.recording import BFLOAT, FLOAT, HALF, INT8, PANEL
 
 FEATURES = (numba.config.CPU_FEATURES or get_host_cpu_features()).split(",")
 EXPANDS_HALF = "+f16c" in FEATURES or platform.machine() in ("aarch64", "arm64")
-"""Whether the CPU can convert half precision to float32 in registers. If not, such weights are stored as float32."""
+"""Whether the CPU can convert float16 to float32 in registers. If not, float16 weights are stored as float32."""
 LANES = PANEL if "+avx512f" in FEATURES else 16
-"""Number of outputs whose sums are computed at once for several rows. The sums must fit into the vector registers."""
+"""Number of outputs that are computed at once for two to six rows. All sums must fit into the vector registers."""
 FAST = {"contract", "reassoc", "nsz"}
 compiled = numba.njit(error_model="numpy", fastmath=FAST)
 NUMBER, WORD, LANE, VOID, ADDRESS = ir.FloatType(), ir.IntType(64), ir.IntType(32), types.void, types.intp
@@ -46,7 +46,7 @@ NUMBER, WORD, LANE, VOID, ADDRESS = ir.FloatType(), ir.IntType(64), ir.IntType(3
 def _tile(rows: int, kind: int, lanes: int) -> Callable[..., None]:
     """Generate the innermost loop of a matrix multiplication: y = (x · weights) · scale + bias.
 
-    It multiplies `rows` rows with `lanes` outputs of one panel (a block of 64 outputs). All sums stay in registers.
+    The loop computes `lanes` outputs of one panel (a block of 64 outputs) for `rows` rows. All sums stay in registers.
 
     Args:
         rows: Number of rows that are multiplied at once.
@@ -54,9 +54,9 @@ def _tile(rows: int, kind: int, lanes: int) -> Callable[..., None]:
         lanes: Number of outputs that are computed at once.
 
     Returns:
-        A function of (weights, factors, inputs, x, stride, y, step). `inputs` is a count. `weights` (inputs, PANEL),
-        `factors` (2, PANEL; scales, then biases), `x` and `y` are memory addresses. The rows of x are `stride` bytes
-        apart, those of y `step` bytes.
+        A function of (weights, factors, inputs, x, stride, y, step). `inputs` is the number of inputs. `weights`
+        (inputs, PANEL), `factors` (2, PANEL; scales, then biases), `x` and `y` are memory addresses. Two rows of x are
+        `stride` bytes apart, and two rows of y are `step` bytes apart.
     """
     formats = {HALF: (ir.HalfType(), 2), INT8: (ir.IntType(8), 1), FLOAT: (NUMBER, 4), BFLOAT: (ir.IntType(16), 2)}
     stored, size = formats[kind]
@@ -110,8 +110,8 @@ def _tile(rows: int, kind: int, lanes: int) -> Callable[..., None]:
 def _product(kind: int, size: int) -> Callable[..., None]:
     """Return a function that multiplies any number of rows with a whole matrix.
 
-    Its arguments are (weights, factors, inputs, panels, x, stride, rows, y, step). `panels` and `rows` are counts. The
-    others are explained in `_tile`; the addresses point to the first panel.
+    Its arguments are (weights, factors, inputs, panels, x, stride, rows, y, step). `panels` and `rows` are the numbers
+    of panels and rows. `_tile` explains the other arguments. The addresses point to the first panel.
 
     Args:
         kind: Number format of the weights, HALF to BFLOAT.
@@ -168,7 +168,7 @@ def _shift(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 get = intrinsic(lambda typing, address, index: (types.float32(ADDRESS, ADDRESS), _read))
 put = intrinsic(lambda typing, address, index, value: (VOID(ADDRESS, ADDRESS, types.float32), _write))
 times_two_to = intrinsic(lambda typing, x, power: (types.float32(types.float32, types.float32), _shift))
-"""`get` reads and `put` writes the float32 number at an index after a memory address.
+"""`get` reads and `put` writes the float32 number at `index` in an array that begins at memory address `address`.
 
 `times_two_to` returns x · 2^power for an integer power from −126 to 127.
 """
@@ -180,7 +180,7 @@ _ZERO, _ONE, _TWO, _LOWEST = np.float32(0), np.float32(1), np.float32(2), np.flo
 
 @compiled
 def exponential(x):
-    """Return e^x with an error of two or three units in the last place. The compiler can vectorise loops over it."""
+    """Return e^x with an error of two or three units in the last place. Loops that call it can be vectorised."""
     x = min(max(x, np.float32(-87)), np.float32(88))
     power = np.rint(x * _LOG2_E)
     x = (x - power * _LN_2) - power * _LN_2_REST
@@ -215,14 +215,14 @@ def rotate(x, to, cos, sin, channels):
 
 @numba.njit(error_model="numpy", fastmath=FAST - {"reassoc"} | {"nnan"})
 def softmax(scores, slots, scale, mask, stop):
-    """Turn attention scores into weights, in place. Hidden slots get exactly 0, whatever they hold.
+    """Turn attention scores into weights, in place. Hidden slots get exactly 0, whatever their scores are.
 
-    The sum is computed in 16 parts, so that hidden slots do not change the rounding.
+    The sum of the weights is computed in 16 parts, so that hidden slots do not change the rounding.
 
     Args:
         scores: Address of the scores, one per slot of the cache.
         slots: Number of slots.
-        scale: Factor of the scores, 1/√C.
+        scale: Factor by which scores are multiplied, 1/√C.
         mask: Address of a number per slot. A slot is hidden if its number is not 0. The address 0 hides no slot.
         stop: Slots from this index on are hidden.
     """
@@ -349,7 +349,7 @@ def choose(frame, columns, numbers):
 def elementwise(code, frame, columns, numbers, indices):
     """Execute one operation on one frame (the memory of one row of the batch), in place.
 
-    `run` executes LINEAR and ATTEND itself.
+    `run` itself executes LINEAR, ATTEND and BRANCH.
 
     Args:
         code: The operation, such as ADD.
@@ -435,10 +435,10 @@ def branch(frames, columns, time, start, mask, results):
         time: Number of earlier executions.
         start: Slot of the first drafted node in the cache.
         mask: (k, slots), 0 for slots that a node sees. Afterwards 0 for slots that the new nodes see.
-        results: (times, 4, k²), of which this call fills `results[time]`. Its first three rows hold the token of each
-            child in this level, the child's parent, and the sum of the log-probabilities on the child's path. Its
-            fourth row holds the indices of the k best children in this level. A parent is an index among all children
-            so far, −1 for the root. The first level has only k children.
+        results: (times, 4, k²). This call fills `results[time]`. The first three of its four rows hold, for each child
+            in this level, the token, the parent, and the sum of the log-probabilities on the child's path. The fourth
+            row holds the indices of the k best children in this level. A parent is an index among the children of all
+            levels so far, or −1 for the root. The first level has only k children.
     """
     nodes, out, a, b = len(frames), columns[1], columns[2], columns[3]
     width, hidden, rows = columns[5], columns[6], nodes if time else 1
@@ -486,21 +486,21 @@ def run(
     Args:
         ops: (operations, columns) int64, see `recording.COLUMNS`.
         begin: Number of executions in earlier calls.
-        end: Number of executions after this call, those of earlier calls included.
-        last: Number of operations in the last execution. Operations that only prepare a further one are left out.
+        end: Number of executions after this call, earlier calls included.
+        last: Number of operations in the last execution. Operations that only prepare a further execution are left out.
         indices: Places (indices in a frame) that GATHER operations copy from.
         numbers: Constants of all operations.
         frames: (B · T, size) float32, one frame (memory) per row. They hold the inputs, and afterwards the outputs.
-        positions: (T,) rotary positions of the first of all executions.
-        start: Number of valid slots in the cache before the first of all executions.
-        cache: (layers, 2, B, A, slots, C) keys and values, to which new ones are appended.
+        positions: (T,) rotary positions in execution 0, even if this call begins with a later execution.
+        start: Number of valid slots in the cache before execution 0, even if this call begins with a later execution.
+        cache: (layers, 2, B, A, slots, C) keys and values. New keys and values are appended.
         keys: (layers, B · A, panels, C, PANEL) copy of the keys, see `attention`.
         values: (layers, B · A, panels, slots, PANEL) copy of the values.
         filled: Number of slots that are already copied to `keys` and `values`.
         mask: (T, start + T · times), 0 for slots that a row sees. Shape (0, 1) means that attention is causal.
         results: (times, 1, B · T), filled with the result of ARGMAX in each execution. For programs that draft a tree
             (times, 4, k²), filled by `branch`.
-        stop: Stop after the execution whose result for the first row equals `stop`. Negative: execute until `end`.
+        stop: Stop after the execution whose result for the first row equals `stop`. If negative, execute until `end`.
     """
     rows, size = frames.shape
     tokens, memory, channels = len(positions), frames.ctypes.data, cache.shape[5]

@@ -2,7 +2,7 @@
 
 A program computes in *frames*: the float32 memory of one row of a batch. A *place* is the index of a number in a frame.
 `recording.py` explains both, and how a module becomes a table of operations. `compile_parts` makes the programs of a
-module, when its weights are final.
+module, once the module's weights are final.
 
 numba compiles the kernels when they are first used on a machine. It stores the machine code in NUMBA_CACHE_DIR if that
 is set, else in `__pycache__`. If this folder cannot be written, numba takes the user's cache folder. If that cannot be
@@ -41,7 +41,7 @@ ROWS = 32  # oneDNN chooses the layout for this many rows; 154 M weights take 27
 
 
 def own_folder() -> Path:
-    """Return a temporary folder that only this user can write, because kerv runs the code in it.
+    """Return a temporary folder that only this user can write, so that kerv can safely run the code in it.
 
     All processes of the user get the same folder. If another user has a folder of that name, a new one is made.
     """
@@ -87,14 +87,14 @@ def kernels() -> ModuleType:
 def multiplies_bfloat16() -> bool:
     """Return whether this CPU and this build of torch can multiply bfloat16 matrices in blocked layout.
 
-    The hardware has instructions for that: AMX or AVX512-BF16.
+    The CPU needs AMX or AVX512-BF16 instructions for this.
     """
     supported = torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
     return bool(supported) and bool(torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported())
 
 
 class Blocked:
-    """The weights of a linear layer in bfloat16, in the blocked layout of oneDNN, torch's library for a CPU's matrices.
+    """The weights of a linear layer in bfloat16, in the blocked layout of oneDNN, torch's matrix library for CPUs.
 
     One token and thirty tokens take almost the same time, because most time is spent on reading the weights. All other
     operations of a program are float32. They are cheap, and rounding them would more often make the two best logits
@@ -133,7 +133,7 @@ class Matrix:
         columns: Size, number format and addresses of the matrix, as entries of an operation in the table of operations
             (see `recording.COLUMNS`).
         nbytes: Bytes of the weights.
-        blocked: The matrix in oneDNN's layout, without panels. None: the matrix is stored in panels.
+        blocked: The matrix in oneDNN's layout, without panels. None if the matrix is stored in panels.
     """
 
     def __init__(self, weight: Tensor, bias: Tensor | None) -> None:
@@ -223,11 +223,11 @@ class Program:
         """Compute the outputs. Each has as many rows as the inputs.
 
         Args:
-            inputs: (rows, …). With attention (B, T, …), which are B · T rows: B sequences of T tokens.
+            inputs: (rows, …). If the program has attention, (B, T, …): B sequences of T tokens, which are B · T rows.
             positions: (T,) rotary positions. None if the program has no attention.
             cache: Keys and values of earlier tokens. The keys and values of the new tokens are written after them, but
-                `cache.length` stays as it is. None: there are no earlier tokens.
-            mask: Result of `attention_mask`. None: attention is causal.
+                `cache.length` stays as it is. None if there are no earlier tokens.
+            mask: Result of `attention_mask`. If None, attention is causal.
 
         Returns:
             The outputs, (rows, …) each.
@@ -244,10 +244,10 @@ class Program:
 
         Args:
             times: Number of executions.
-            inputs: Inputs of the first execution, one token of each of B sequences.
+            inputs: Inputs of the first execution: one token for each of B sequences.
             cache: Keys and values of earlier tokens. Each execution appends the keys and values of one more token, but
                 `cache.length` stays as it is.
-            end: Token after which to stop, in the results of the first sequence. None: execute `times` times.
+            end: Stop after an execution whose result for the first sequence is this token. If None, never stop early.
 
         Returns:
             (executions, B) float32, the result of the ARGMAX operation in each execution.
@@ -262,7 +262,7 @@ class Program:
         """Draft EAGLE-2's dynamic tree in one call. Every execution of the program adds a level.
 
         At each level, the `top_k` nodes with the highest cumulative log-probability get `top_k` children each. In the
-        end the most probable nodes of all are kept. Of equally probable nodes the first ones are kept.
+        end the most probable nodes of all levels are kept. Of equally probable nodes the first ones are kept.
 
         Args:
             levels: Maximum number of tokens on a path.
@@ -294,16 +294,16 @@ class Program:
         results: np.ndarray | None = None,
         end: int | None = None,
     ) -> np.ndarray:
-        """Execute the program once, or as often as `results` has rows. Return the frames (rows, size).
+        """Execute the program once, or `times` times if `results` is given. Return the frames (rows, size).
 
         Args:
             inputs: Inputs of the first execution.
             positions: (T,) rotary positions. None if the program has no attention.
-            cache: Keys and values of earlier tokens. None: there are no earlier tokens.
-            mask: Result of `attention_mask`. None: attention is causal.
+            cache: Keys and values of earlier tokens. None if there are no earlier tokens.
+            mask: Result of `attention_mask`. If None, attention is causal.
             results: (times, 1, B) float32, or (levels, 4, top_k²) for `grow`. It is filled with the results of each
-                execution. None: execute once.
-            end: Result after which to stop. None: stop only after the last execution.
+                execution. If None, execute once.
+            end: Stop after an execution whose result for the first sequence is this token. If None, never stop early.
 
         Raises:
             IndexError: The cache has too little room for the new tokens.
@@ -336,7 +336,7 @@ class Program:
     def _alternate(self, times: int, end: int, frames: np.ndarray, *rest: Any) -> None:
         """Execute a program in which oneDNN multiplies some of the matrices.
 
-        One compiled call executes the operations between two such matrices.
+        One compiled call executes all operations between two multiplications by oneDNN.
         """
         memory, run = torch.from_numpy(frames), self.run
         where, start, buffer, keys, values, filled, seen, results = rest
@@ -356,12 +356,12 @@ class Program:
 
 
 def _executed(results: np.ndarray) -> int:
-    """Return how many of the executions ran. `results` has the shape (times, 1, B)."""
+    """Return how many executions ran: the rows of `results` (times, 1, B) whose first number is not NOTHING."""
     return int((results[:, 0, 0] != NOTHING).sum())
 
 
 def _columns_of(op: dict[str, Any]) -> list[tuple[slice, slice]]:
-    """Return where a frame holds each row of a large matrix's input, and where the row's result goes."""
+    """Return two slices of a frame for each row of a large matrix's input: the row's input and the row's result."""
     columns = []
     for row in range(op["rows"]):
         a, out = op["a"] + row * op["stride"], op["out"] + row * op["step"]
@@ -375,9 +375,9 @@ M = TypeVar("M", bound=nn.Module)
 class Compilable(nn.Module):
     """A module that can be compiled for a CPU while its weights are frozen.
 
-    Moving the module, loading weights into it, unfreezing or copying it discards the compiled form, and torch computes
-    as usual. After changing weights in any other way (`parameter.data`, a submodule's own `load_state_dict`), call
-    `compile_parts` again.
+    If the module is moved or unfrozen, or weights are loaded into it, the compiled form is discarded and torch computes
+    as usual. A copy has no compiled form. After changing weights in any other way (`parameter.data`, a submodule's own
+    `load_state_dict`), call `compile_parts` again.
 
     Attributes:
         compiled: The compiled form. None if the module is not compiled.
@@ -392,7 +392,8 @@ class Compilable(nn.Module):
     def runs_compiled(self, *inputs: Tensor) -> bool:
         """Return whether to use the compiled form: True if it exists and no gradients are needed.
 
-        While a program is recorded, the inputs are `Recorded`, and torch's form of the module is recorded.
+        While a program is recorded, the inputs are `Recorded`. The result is then False, so that torch's form is
+        recorded.
         """
         for x in inputs:
             if not isinstance(x, Tensor) or (x.requires_grad and torch.is_grad_enabled()):
@@ -431,7 +432,7 @@ class CompilableLinear(Compilable, nn.Linear):
 
 
 def compile_parts(module: nn.Module) -> None:
-    """Compile every `Compilable` submodule of a module, and store the compiled form in its `compiled`.
+    """Compile every `Compilable` submodule of a module, and set the submodule's attribute `compiled`.
 
     Nothing happens unless all parameters are frozen, on a CPU, and all in float32 or all in bfloat16.
     """

@@ -37,10 +37,11 @@ out, a, b: Place of the first element of the result, of the first input and of t
 rows, width: Number of rows of the input, and of elements per row.
 stride: Distance between two input rows in elements. For ATTEND the index of the layer in the cache; for BRANCH the size
     of a hidden state.
-first: Index of the operation's first constant in `Tape.numbers`; for GATHER of its first index in `Tape.indices`.
+first: Index of the operation's first constant among all `Tape.numbers`. For GATHER the index of the operation's first
+    entry in `Tape.indices`.
 step: Distance between two result rows in elements.
 weights, factors: Memory addresses of a matrix's weights, and of its scales and biases.
-panels: Number of panels of the matrix.
+panels: Number of panels of the matrix. For a BLOCKED matrix the number of outputs.
 kind: Number format of the weights, HALF to BLOCKED.
 """
 _ALIGNED = 16  # registers begin at multiples of this place
@@ -51,8 +52,8 @@ class Recorded:
     """Stand-in for a float32 tensor of batch size 1 on a CPU. Operations on it are recorded, not computed.
 
     Attributes:
-        tape: The tape that records its operations.
-        place: Integer tensor: for each element, its index in the float32 memory (frame) of one batch row.
+        tape: The tape that records operations on this value.
+        place: Integer tensor. It holds the index of each element in the float32 memory (frame) of one batch row.
         shape: The shape of the tensor and of `place`.
     """
 
@@ -64,7 +65,7 @@ class Recorded:
 
     @property
     def first(self) -> int:
-        """Place of the first element."""
+        """Place (index in the frame) of the first element."""
         return int(self.place.flatten()[0])
 
     @classmethod
@@ -112,7 +113,7 @@ class Recorded:
         return self.tape.elementwise(CLAMP, self, numbers=[low, high])
 
     def mean(self, dim: int) -> Recorded:
-        """Average over dimension 1, the only one that is supported."""
+        """Return the mean over dimension 1. `dim` must be 1."""
         assert dim == 1
         first, *others = self.split(1, 1)
         return (sum(others, start=first) / self.shape[1])[:, 0]
@@ -125,11 +126,13 @@ class Recorded:
     def branch(self, hidden: Recorded) -> tuple[Recorded, Recorded]:
         """Record the operation that grows one level of a draft tree; see `Program.grow`.
 
+        Each row of the batch stands for one node of the tree. This value has the logits of the node's children.
+
         Args:
-            hidden: (…, E) hidden state of a row's node. This value has the logits of the node's children.
+            hidden: (…, E) hidden state of the row's node.
 
         Returns:
-            The token (1,) of the new node that the row stands for, and its parent's hidden state (…, E).
+            The token (1,) of the node that the row stands for afterwards, and the hidden state (…, E) of its parent.
         """
         size = hidden.place.numel()
         out = self.tape.emit(BRANCH, (1 + size,), [self, hidden], self.place.numel(), stride=size)
@@ -200,9 +203,9 @@ class Tape:
         """Append an operation.
 
         Args:
-            code: What it computes, such as LINEAR.
+            code: What the operation computes, such as LINEAR.
             out: Value that receives the result, or the shape of a new register for the result.
-            inputs: Up to two values that the operation reads. The second one counts as a single row.
+            inputs: One or two values that the operation reads. The second value counts as a single row.
             width: Number of elements in each row of the first input.
             numbers: Constants that the operation reads, such as a norm's gain.
             **columns: Further entries of the operation, with the names in COLUMNS.
@@ -222,14 +225,14 @@ class Tape:
         return out
 
     def lined(self, x: Recorded, width: int) -> tuple[Recorded, int, int]:
-        """Return a value whose rows are contiguous and equally spaced in the frame: the value itself, or a copy.
+        """Return `x` if its rows are contiguous and equally spaced in the frame. Else return a copy with such rows.
 
         Args:
             x: The value.
             width: Number of elements in a row.
 
         Returns:
-            The value or its copy, the number of rows, and the distance between the starts of two rows in elements.
+            `x` or its copy, the number of rows, and the distance between the starts of two rows, in elements.
         """
         rows = x.place.reshape(-1, width)
         stride = int(rows[1, 0] - rows[0, 0]) if len(rows) > 1 else width
@@ -249,7 +252,7 @@ class Tape:
         """Append an elementwise operation on inputs, which are broadcast to one shape. Return the result.
 
         Args:
-            code: What it computes, such as ADD.
+            code: What the operation computes, such as ADD.
             inputs: One or two values.
             numbers: Constants that the operation reads.
         """

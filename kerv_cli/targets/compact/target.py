@@ -4,10 +4,10 @@ The prompt is [vision grid] [instruction] [scene] [proprioception]. The last pro
 of several camera views gives one vision grid per view.
 
 Scene tokens encode the *places*: the 3D positions that matter to the task, such as object and goal. They contain each
-place's position, the vector from the hand to it, and the vector from it to the next place. With `observation=vision`
-these positions are estimated from the image. The estimate is trained on the simulator's positions, which are never
-read afterwards. With `observation=state` the simulator gives the positions, together with the rest of its state. Such a
-policy has privileged information. It serves to study decoding without perception.
+place's position, the vector from the hand to the place, and the vector from the place to the next one. With
+`observation=vision` these positions are estimated from the image. The estimate is trained on the simulator's positions,
+which are never read afterwards. With `observation=state` the simulator gives the positions, together with the rest of
+its state. Such a policy has privileged information. It serves to study decoding without perception.
 
 Shapes: B observations, p and s numbers of proprioception and state, L words, K places, P prompt tokens, T new tokens, N
 tokens of a chunk, V action tokens, E width.
@@ -83,7 +83,7 @@ class CompactTarget(Compilable):
     Attributes:
         cameras: One name: the camera whose images are read. Empty if the policy reads the state.
         frame_shape: Shape (height, width, 3) of an image.
-        segments: Positions of the tokens in each part of the prompt (a slice), by the part's name.
+        segments: Slice of prompt positions that each part of the prompt takes, by the part's name.
         max_prompt: P, number of prompt tokens. It is the same for every observation and instruction.
         pooled_width: F, number of values that `pooled` returns per prompt.
         sha256: Hash of the weights that were loaded. Empty if no weights were loaded.
@@ -93,10 +93,10 @@ class CompactTarget(Compilable):
         width: E, width of the embeddings and hidden states.
         heads: Number of attention heads of a layer, also in a drafter's layers.
         feed_forward: Number of hidden units of a layer, also in a drafter's layers.
-        enlarges: Function that enlarges a drafter, if drafters are enlarged together with this target (docs/methods.md
-            §0.2). None: drafters stay as they are.
+        enlarges: Function that enlarges a drafter in place, as this target was enlarged (docs/methods.md §0.2). None if
+            drafters stay as they are.
         hand_and_object: Positions (3,) in metres of the hand and the object in the last observation that `encode` read.
-            A vision policy estimates the object's position. None: `encode` has read no observation yet.
+            A vision policy estimates the object's position. None until `encode` has read an observation.
     """
 
     centre: Tensor
@@ -248,7 +248,7 @@ class CompactTarget(Compilable):
         return self.prompt(*given)
 
     def prompt(self, words: Tensor, proprioception: Tensor, *seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute what `encode_batch` returns, in torch: prompts, and 3D positions of object, goal and so on.
+        """Compute in torch what `encode_batch` returns: prompts (B, P, E), and positions (B, K, 3) in metres.
 
         While a program is recorded, all arguments are `Recorded`, stand-ins for tensors.
 
@@ -301,11 +301,11 @@ class CompactTarget(Compilable):
         return Programs(Program(self.prompt, *shapes), Program(step, (1, 1), repeats=True))
 
     def join(self, function: Callable[..., Any], *shapes: tuple[int, ...], repeats: bool = False) -> Program | None:
-        """Compile a function that calls modules of the target and of a compiled drafter; see `JoinsDrafters.join`."""
+        """Compile a function that calls modules of the target and of a drafter, as `JoinsDrafters.join` explains."""
         return Program(function, *shapes, repeats=repeats) if self.compiled is not None else None
 
     def enlarge(self, drafter: Any) -> None:
-        """Enlarge a small policy's drafter in place, if this target was made by enlarging a small policy."""
+        """Enlarge a drafter in place, if this is a grown target whose recipe enlarges the drafter, too."""
         if self.enlarges is not None:
             self.enlarges(drafter)
 
@@ -352,7 +352,7 @@ class CompactTarget(Compilable):
 
         Args:
             prompt: (B, P, E).
-            cache: An empty cache, which this call fills. None: compute without a cache.
+            cache: An empty cache, which this call fills. If None, no cache is used.
         """
         x = torch.cat([prompt, self.queries.to(prompt.dtype).expand(len(prompt), -1, -1)], 1)
         visible = np.tri(x.shape[1], dtype=bool)
@@ -413,8 +413,8 @@ def save_target(
         environment: Name of the environment that the target's demonstrations come from.
         provenance: How the target was made, see `provenance_of`.
         stored: Number format of the stored weights: float32, float16 or int8.
-        state_range: The 0.1th percentile of each number of the demonstrations' states, then the 99.9th percentile of
-            each. None: not recorded.
+        state_range: The 0.1th percentiles, then the 99.9th percentiles, of the demonstrations' states. Each sequence
+            has one percentile per number of the state. None if the range was not measured.
     """
     others: dict[str, Any] = {"cameras": target.cameras, "words": target.words.words, "provenance": provenance}
     if state_range:
@@ -429,8 +429,8 @@ def build(folder: Path, description: TargetDescription, device: str, dtype: torc
 
     Args:
         folder: Folder with the weights.
-        description: The content of its `target.json`.
-        device: Device to load it to.
+        description: The content of the target's `target.json`.
+        device: Device to load the target to.
         dtype: Number format to convert the weights to.
 
     Raises:

@@ -66,9 +66,9 @@ class Layer(nn.Module):
         Args:
             x: (B, T, width) input: a tensor, or its stand-in `Recorded` while a program is recorded.
             rotary: Cosines and sines, (T, 1, C) each.
-            cache: (2, B, A, capacity, C) keys and values of this layer's A heads. None: there are no earlier tokens.
+            cache: (2, B, A, capacity, C) keys and values of this layer's A heads. None if there are no earlier tokens.
             slots: Slots of the cache that the new keys and values are written to.
-            mask: Result of `attention_mask`. None: attention is causal.
+            mask: Result of `attention_mask`. If None, attention is causal.
         """
         qkv = self.qkv(self.attention_norm(x))
         if isinstance(qkv, Tensor):
@@ -128,7 +128,7 @@ class LayerStack(Compilable):
         Args:
             batch: Number of sequences.
             capacity: Maximum number of tokens.
-            fixed: Whether every forward attends to all slots, so that its shapes are fixed. None: only on CUDA.
+            fixed: Whether every forward attends to all slots, so that all shapes are fixed. If None, only on CUDA.
         """
         like = self.weight
         if self.compiled is not None:
@@ -147,8 +147,9 @@ class LayerStack(Compilable):
         Args:
             inputs: Tensors (B, T, E), as `enter` takes them.
             positions: (T,) rotary positions of the new tokens.
-            cache: Keys and values of earlier tokens. This forward appends the new ones. None: no earlier tokens.
-            seen: (T, M) bool, which of the last M tokens, old or new, each new token attends to. None: causal mask.
+            cache: Keys and values of earlier tokens. This forward appends the new ones. None if there is no cache.
+            seen: (T, M) bool, which of the last M tokens, old or new, each new token attends to. If None, attention
+                is causal.
         """
         tokens, padding = inputs[0].shape[1], 0 if cache is not None and cache.length else self.padding
         if padding:
@@ -194,9 +195,9 @@ class LayerStack(Compilable):
         Args:
             x: (B, T, width) input of the first layer.
             positions: (T,) rotary positions.
-            cache: Keys and values of earlier tokens. None: there are none.
+            cache: Keys and values of earlier tokens. None if there are no earlier tokens.
             slots: Slots of the cache that the new keys and values are written to.
-            mask: Result of `attention_mask`. None: attention is causal.
+            mask: Result of `attention_mask`. If None, attention is causal.
         """
         rotary = self.rotary(positions)
         for i, layer in enumerate(self.layers):
@@ -205,7 +206,7 @@ class LayerStack(Compilable):
 
 
 class Trunk(LayerStack):
-    """The target's decoder layers. The head and the drafter read its hidden states."""
+    """The target's decoder layers. The head and the drafter read the hidden states that it returns."""
 
     def __init__(self, width: int, layers: int, heads: int, feed_forward: int) -> None:
         super().__init__(width, layers, heads, feed_forward)

@@ -1,8 +1,8 @@
 """Read the configuration and the action statistics of a Hugging Face OpenVLA checkpoint.
 
-The `config.json` of a published checkpoint gives timm's names of its two vision encoders (towers), but no shapes. Of
-its language model it gives only what differs from Llama-2 7B. This module fills in the rest. A checkpoint of a
-different size must give the shapes of its towers in the field `vision_shapes`.
+The `config.json` of a published checkpoint gives timm's names of the two vision encoders (towers), but not their
+shapes. For the language model it gives only the fields that differ from Llama-2 7B. This module fills in the rest. A
+checkpoint of a different size must give the shapes of its towers in the field `vision_shapes`.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ class Tower:
 
     Attributes:
         width: Number of channels.
-        depth: Number of blocks. The output of the last one is never used.
+        depth: Number of blocks. The output of the last block is never used.
         heads: Number of attention heads.
         feed_forward: Hidden units of a block.
         registers: Number of learned tokens after the class token.
-        scaled: Whether it is a DINOv2: blocks have layer scales, and the first token is a class token.
+        scaled: Whether the tower is a DINOv2. Then its blocks have layer scales, and its first token is a class token.
         image: Pixels per side of the image.
         patch: Pixels per side of a patch.
     """
@@ -165,8 +165,8 @@ class Bounds:
     Attributes:
         q01: 1st percentile of the actions.
         q99: 99th percentile of the actions.
-        mask: Whether each DoF is normalised with the percentiles. A gripper, for example, is not. None: all DoFs are
-            normalised.
+        mask: Whether each DoF is normalised with the percentiles. A gripper, for example, is not. None if all
+            DoFs are normalised.
     """
 
     q01: tuple[float, ...]
@@ -181,7 +181,7 @@ def read_statistics(folder: Path, name: str | None) -> tuple[str, Bounds]:
 
     Args:
         folder: Folder of the checkpoint.
-        name: Name of the data set. None: the only one in the checkpoint.
+        name: Name of the data set. If None, the checkpoint must have statistics of only one data set.
 
     Returns:
         The name of the data set and its statistics.
@@ -211,12 +211,12 @@ def action_space(shape: Shape, bounds: Bounds, like: ActionSpace | None, control
         shape: Shape of the checkpoint.
         bounds: Action statistics, which become `low` and `high` of the space. A DoF that `bounds.mask` excludes gets -1
             and 1.
-        like: Action space of an environment, from which names, groups, strict DoFs and control rate are copied. None:
-            OpenVLA's seven DoFs.
+        like: Action space of an environment, from which names, groups, strict DoFs and control rate are copied. If
+            None, the space has OpenVLA's seven DoFs.
         control_hz: Control steps per second if `like` is None.
 
     Raises:
-        CheckpointError: The statistics have a different number of DoFs, or both percentiles of a DoF are equal.
+        CheckpointError: The statistics have a different number of DoFs, or a DoF's `low` is not below its `high`.
     """
     from kerv_cli.base.spaces import ActionSpace, Group
 

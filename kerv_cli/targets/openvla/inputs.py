@@ -81,8 +81,9 @@ def cropped(image: np.ndarray, size: int) -> np.ndarray:
 def as_in_libero(image: np.ndarray, size: int) -> np.ndarray:
     """Prepare an image (h, w, 3) uint8 as OpenVLA's evaluation on LIBERO does before it crops. Return (size, size, 3).
 
-    This equals `resize_image` of its libero_utils. The image is first compressed as JPEG, as the training images were,
-    with TensorFlow's settings (quality 95, colour at half resolution). Then it is resized by Lanczos with antialiasing.
+    This equals the function `resize_image` in OpenVLA's libero_utils. The image is first compressed as JPEG, as the
+    training images were, with TensorFlow's settings (quality 95, colour at half resolution). Then it is resized by
+    Lanczos with antialiasing.
     """
     file = io.BytesIO()
     Image.fromarray(image).save(file, "JPEG", quality=95, subsampling="4:2:0")
@@ -101,11 +102,12 @@ def pixels_of(
         image: (h, w, 3) uint8.
         shape: Shapes of the checkpoint.
         normalisations: Normalisation of the pixels for each tower.
-        crop: Whether to crop the image to its central 90 %.
+        crop: Whether to crop the image to the central 90 % of its area.
         libero: Whether to apply `as_in_libero` first.
 
     Returns:
-        (1, 6, s, s) float32: three channels normalised for the first tower, then three for the second.
+        (1, 6, s, s) float32, s pixels per side: three channels normalised for the first tower, then three for the
+        second.
     """
     parts = []
     for tower, normal in zip(shape.towers, normalisations, strict=True):
@@ -132,7 +134,7 @@ PROMPTS = {
         "ASSISTANT:"
     ),
 }
-"""Version -> text of the prompt; `{}` is replaced by the instruction. v0.1 checkpoints need the second."""
+"""Text of the prompt, by version. The instruction replaces `{}`. v0.1 checkpoints need `openvla_v01`."""
 
 
 class Prompter:

@@ -153,7 +153,7 @@ def load_model(folder: Path, shape: Shape, device: str, dtype: torch.dtype, int8
     Args:
         folder: Folder of the checkpoint.
         shape: Shapes of the checkpoint.
-        device: Device to load it to.
+        device: Device to load the model to.
         dtype: Number format to convert the weights to.
         int8: Whether to convert the layers of the language model to one byte per weight.
 

@@ -1,7 +1,7 @@
 """The network of OpenVLA: two vision towers, a projector, and Llama-2 with tree attention over a key/value cache.
 
 Modules have the names that published checkpoints use, so that their weights can be memory-mapped. Weights without
-effect are left out: the last block of each tower (OpenVLA takes the output of the last but one), the norm after it and
+effect are left out: the last block of each tower (OpenVLA takes the output of the block before it), the final norm, and
 SigLIP's pooling head.
 
 Shapes: B batch, T new tokens, S cached tokens, E width of the language model, A heads, K heads of keys and values, C
@@ -61,8 +61,8 @@ class LlamaAttention(nn.Module):
         Args:
             x: (B, T, E) input.
             rotary: Cosines and sines of the tokens' positions.
-            mask: Result of `attention_mask`. None: attention is causal.
-            cache: (2, B, K, capacity, C) keys and values of this layer. None: there are no earlier tokens.
+            mask: Result of `attention_mask`. If None, attention is causal.
+            cache: (2, B, K, capacity, C) keys and values of this layer. None if there are no earlier tokens.
             slots: Slots of the cache that the new keys and values are written to.
         """
         q = rotate(self.q_proj(x).unflatten(-1, (self.heads, -1)).transpose(1, 2), *rotary)
@@ -120,8 +120,8 @@ def run_layers(
         language: Shape of the language model.
         x: (B, T, E) embeddings of the new tokens.
         positions: (T,) rotary positions of the new tokens.
-        cache: Keys and values of earlier tokens. This forward appends the new ones. None: no earlier tokens.
-        mask: Result of `attention_mask`. None: attention is causal.
+        cache: Keys and values of earlier tokens. This forward appends the new ones. None if there is no cache.
+        mask: Result of `attention_mask`. If None, attention is causal.
     """
     rotary = rotation(positions, language.channels, language.rope_theta, x.dtype)
     slots = cache.next_slots(x.shape[1]) if cache is not None else None
@@ -158,7 +158,7 @@ class LanguageModel(nn.Module):
 
 
 def named(**layers: nn.Module) -> nn.Sequential:
-    """Return the layers in sequence. Each keyword names its layer, and so the layer's weights."""
+    """Return the layers in sequence. The keyword of a layer becomes part of the names of its weights."""
     return nn.Sequential(OrderedDict(layers))
 
 

@@ -41,7 +41,7 @@ _SIGLIP = {
     "pos_embed": "embeddings.position_embedding.weight",
     "patch_embed.proj": "embeddings.patch_embedding",
 }
-"""Part of timm's name of a weight -> part of its name in transformers, for each tower."""
+"""`_DINO` and `_SIGLIP` map a part of a weight's name in timm to the part of its name in transformers."""
 
 
 def check_installed() -> None:
@@ -65,7 +65,7 @@ class Reference:
         dtype: Number format of the weights.
 
     Raises:
-        UsageError: The package is not installed.
+        UsageError: transformers is not installed.
         CheckpointError: The checkpoint is damaged.
     """
 
@@ -84,7 +84,7 @@ class Reference:
         Args:
             model: A model of transformers.
             weights: The weights, under transformers' names.
-            strict: Whether every weight of the model must be given.
+            strict: Whether `weights` must contain every weight of the model.
         """
         assert not model.load_state_dict(weights, strict=strict).unexpected_keys
         return model.to(device=self.device, dtype=self.dtype).eval()
@@ -150,18 +150,18 @@ class Reference:
 
 
 def _sizes(tower: Tower) -> dict[str, Any]:
-    """Return the sizes that transformers' configurations of both towers have."""
+    """Return a tower's sizes, under the names that transformers' configurations of both towers share."""
     image = {"image_size": tower.image, "patch_size": tower.patch}
     layers = {"num_hidden_layers": tower.depth - 1}  # OpenVLA takes the last but one
     return {"hidden_size": tower.width, "num_attention_heads": tower.heads, **layers, **image}
 
 
 def _renamed(weights: Mapping[str, Tensor], names: Mapping[str, str]) -> dict[str, Tensor]:
-    """Return a vision tower's weights under transformers' names, with queries, keys and values apart.
+    """Return a vision tower's weights under transformers' names. Queries, keys and values get separate weights.
 
     Args:
         weights: Weights of the tower.
-        names: Part of timm's name -> part of transformers' name.
+        names: Map from a part of a weight's name in timm to the part of its name in transformers.
     """
     found: dict[str, Tensor] = {}
     for name, weight in weights.items():
@@ -176,22 +176,23 @@ def _renamed(weights: Mapping[str, Tensor], names: Mapping[str, str]) -> dict[st
 
 @torch.inference_mode()
 def parity(target: Any) -> dict[str, float]:
-    """Decode sample observations, and compare each token and its logits with those of the transformers package.
+    """Decode sample observations, and compare the tokens and logits with the results of the transformers package.
 
-    Both compute the logits of a token after the same prompt and the same earlier tokens.
+    kerv and transformers compute the logits of a token after the same prompt and the same earlier tokens.
 
     Args:
-        target: An `OpenVLATarget`. The `Reference` is loaded in float32, then moved to its device and number format.
+        target: An `OpenVLATarget`. The `Reference` is loaded in float32, then moved to the target's device and
+            number format.
 
     Returns:
         Numbers by name, in this order:
 
-        - Tokens that were compared.
-        - Tokens that differ from transformers' most probable action token.
-        - Of the differing tokens, those whose two largest logits are equal in bfloat16.
-        - Of all compared tokens, those whose two largest logits are equal in bfloat16.
-        - Tokens for which transformers' most probable id is not an action token.
-        - Largest difference of two logits.
+        - Number of compared tokens.
+        - Number of tokens that differ from transformers' most probable action token.
+        - Number of differing tokens whose two largest logits are equal in bfloat16.
+        - Number of compared tokens whose two largest logits are equal in bfloat16.
+        - Number of tokens for which transformers' most probable id is not an action token.
+        - Largest difference between a logit of kerv and the same logit of transformers.
 
     Raises:
         UsageError: transformers is not installed.

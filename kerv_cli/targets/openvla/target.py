@@ -74,7 +74,7 @@ class OpenVLATarget:
     def __init__(
         self, settings: OpenVLASettings, description: TargetDescription, device: str, dtype: torch.dtype
     ) -> None:
-        """Load and freeze the checkpoint; arguments and errors as `build`."""
+        """Load and freeze the checkpoint of `settings`. `build` explains the other arguments and the errors."""
         source = Path(settings.checkpoint)
         self.settings, self.actions, self.cameras = settings, description.actions, tuple(description.cameras)
         self.observation = description.observation
@@ -128,7 +128,7 @@ class OpenVLATarget:
         Args:
             batch: Number of sequences.
             capacity: Maximum number of tokens.
-            fixed: Whether every forward attends to all slots, so that its shapes are fixed. None: only on CUDA.
+            fixed: Whether every forward attends to all slots, so that all shapes are fixed. If None, only on CUDA.
         """
         fixed = self.action_rows.is_cuda if fixed is None else fixed
         return Cache(*self.shape.language.cache_sizes(batch, capacity), self.action_rows, fixed)
@@ -147,12 +147,13 @@ def build(folder: Path, description: TargetDescription, device: str, dtype: torc
 
     Args:
         folder: Folder of the target, for error messages. The weights are in the checkpoint's own folder.
-        description: The content of its `target.json`.
-        device: Device to load it to.
+        description: The content of the target's `target.json`.
+        device: Device to load the target to.
         dtype: Number format to convert the weights to.
 
     Raises:
         CheckpointError: The description does not belong to an OpenVLA target, or the checkpoint is missing or damaged.
+        KervError: The Python package `tokenizers` is not installed.
     """
     return OpenVLATarget(read_settings(folder, description), description, device, dtype)
 
@@ -161,7 +162,7 @@ def read_settings(folder: Path, description: TargetDescription) -> OpenVLASettin
     """Return the settings in a target's description.
 
     Raises:
-        CheckpointError: The settings are not those of an OpenVLA target, or not exactly one camera is named.
+        CheckpointError: The settings are not those of an OpenVLA target, or the number of cameras is not one.
     """
     path = str(folder / "target.json")
     if len(description.cameras) != 1:
@@ -193,13 +194,14 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
     """Make a target from an OpenVLA checkpoint: check all its weights, and write `target.json`.
 
     Returns:
-        The target's folder, and numbers to print by name, such as the number of parameters.
+        The target's folder, and numbers to print, each with its name, such as the number of parameters.
 
     Raises:
         UsageError: No checkpoint is named, it has statistics of several data sets and none is chosen, or `check` is
             set and transformers is not installed.
         UnknownName: The chosen statistics or the environment do not exist.
         CheckpointError: The checkpoint is incomplete, damaged, pickled, or of a different model.
+        KervError: The Python package `tokenizers` is not installed.
     """
     if not settings.checkpoint:
         raise UsageError("checkpoint=DIR: name the folder of a Hugging Face OpenVLA checkpoint")
