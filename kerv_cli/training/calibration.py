@@ -4,7 +4,8 @@ The numbers are measured on demonstrations. The JSON file holds:
 
 - the noise of the kinematic predictors,
 - each task's K_S, the reference level of the kinematic variability K (how far drafts are from the target's tokens),
-- the ranges by which the boundary between retrieval and drafter scales curvature and path length,
+- the ranges of the hand's curvature and path length, with which the boundary between retrieval and drafter normalises
+  both,
 - for each task the smallest similarity at which a retrieved chunk is executed without verification.
 """
 
@@ -42,19 +43,19 @@ from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.files import DemoEpisode
 
 DRAFTS = {"proposer": "drafter", "acceptance": "relaxed", "threshold": "fixed"}
-"""Parts of the method whose decodes measure K_S."""
+"""Parts of the method that decodes to measure K_S, the reference level of the kinematic variability K."""
 PRESAMPLED = 6
 """The decodes that measure K_S are spread over about this many episodes per task."""
 
 ENTRIES = 4000
 """Maximum number of datastore entries looked up per task, evenly spread.
 
-On MT10, skip levels from 1000 entries did not hold on other episodes.
+On MT10, skip levels derived from 1000 entries allowed too many wrong chunks in other episodes.
 """
 LEAST = 20
 """Minimum number of matches from which a skip level (similarity at which verification is skipped) is derived."""
 LOW, HIGH = 2.0, 1 / 3
-"""Share of wrong chunks that the lower and the upper bound of s_min allow, relative to the share that s_min allows.
+"""The lower and the upper bound of s_min allow this many times the share of wrong chunks that s_min allows.
 
 s_min is the smallest similarity at which verification is skipped.
 """
@@ -214,10 +215,10 @@ def reference_level(records: Sequence[DecodeRecord], actions: ActionSpace, chunk
 
 
 def episode_decodes(decoder: Decoder, dataset: DemoDataset, index: int, decodes: int) -> list[DecodeRecord]:
-    """Decode observations that are spread evenly over one demonstration.
+    """Decode observations that are spread evenly over one demonstration, and return the records of the decodes.
 
-    The decoder also gets every executed action in between, because some methods use a history. A decode that compared
-    no draft with the target is left out.
+    The decoder also gets every action executed between these observations, because some methods use a history. A decode
+    that compared no draft with the target is left out.
 
     Args:
         decoder: The decoder.
@@ -243,17 +244,16 @@ def episode_decodes(decoder: Decoder, dataset: DemoDataset, index: int, decodes:
 def fit_boundary(
     paths: list[np.ndarray], windows: Sequence[int], old: stored.Calibration | None, progress: OnProgress
 ) -> stored.BoundarySection:
-    """Return the ranges of curvature and path length, for each window length.
+    """Return the ranges of the hand's curvature and path length, for each window length.
 
     Args:
         paths: Positions of the end effector in each episode, (T, 3) metres.
         windows: Window lengths, in positions.
-        old: An earlier calibration. Its ranges are kept, for the window lengths that it has. None: there is no earlier
-            calibration.
+        old: An earlier calibration. The ranges in it are kept. None if there is no earlier calibration.
         progress: Called with two numbers: finished window lengths, all window lengths.
 
     Raises:
-        CheckpointError: No path is curved.
+        CheckpointError: No path is curved, or the hand never moves.
     """
     known = old.boundary.windows if old is not None and old.boundary is not None else {}
     ranges = dict(known)
@@ -264,7 +264,7 @@ def fit_boundary(
 
 
 def completed(old: stored.Calibration, new: stored.Calibration) -> stored.Calibration:
-    """Return the old calibration, completed with the numbers of the new one that the old one lacks.
+    """Return the old calibration. Numbers that the old calibration lacks come from the new one.
 
     The boundary ranges are those of `new`, because `fit_boundary` has already copied the old ranges into `new`.
     """
@@ -294,7 +294,7 @@ def episode_windows(episode: DemoEpisode, actions: ActionSpace, window: int, hor
         episode: A demonstration.
         actions: The action space, to normalise actions.
         window: Number of control steps before the moment.
-        horizon: Number of control steps after the moment.
+        horizon: Number of control steps from the moment on.
 
     Returns:
         The expert's undisturbed actions of D DoFs around each moment (n, window + horizon, D), oldest first.
@@ -313,22 +313,23 @@ def episode_windows(episode: DemoEpisode, actions: ActionSpace, window: int, hor
 def read_windows(
     dataset: DemoDataset, chosen: Sequence[int], actions: ActionSpace, window: int, horizon: int, progress: OnProgress
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], dict[str, dict[str, int]]]:
-    """Read the windows of the chosen episodes: the expert's actions around n moments (control steps).
+    """Read the expert's actions around n moments (control steps) of episodes, see `episode_windows`.
 
     Args:
         dataset: The demonstrations.
         chosen: Indices of the episodes in the dataset.
         actions: The action space, to normalise actions.
         window: Number of control steps before each moment.
-        horizon: Number H of control steps after each moment.
+        horizon: Number H of control steps from each moment on.
         progress: Called with two numbers: episodes read, all episodes.
 
     Returns:
-        Normalised actions of D DoFs before each moment (n, window, D) and after it (n, H, D); the end effector's
-        positions in each episode, (T, 3) metres; and the number of episodes of each task, as in `Demonstrations`.
+        Normalised actions of D DoFs before each moment (n, window, D) and from it on (n, H, D). The end effector's
+        positions in each episode, (T, 3) metres. The number of episodes of each task, as in `Demonstrations`.
 
     Raises:
         KervError: A task has no episode that is longer than the window.
+        CheckpointError: A recording is damaged or holds too few actions of the expert after the episode's end.
     """
     counts: dict[str, dict[str, int]] = {}
     parts, paths = [], []
@@ -350,7 +351,7 @@ def choose_episodes(dataset: DemoDataset, tasks: Sequence[str], limit: int) -> l
     Args:
         dataset: The demonstrations.
         tasks: Full names of the tasks.
-        limit: Maximum number of episodes per task; 0: all.
+        limit: Maximum number of episodes per task. If 0, all episodes are taken.
 
     Raises:
         CheckpointError: A task has no demonstration.
@@ -369,9 +370,9 @@ def fit_noise(past: np.ndarray, future: np.ndarray, dampings: Sequence[float]) -
     absolute error.
 
     Args:
-        past: (n, window) normalised actions before each moment.
-        future: (n, H) normalised actions after each moment.
-        dampings: Factors of the velocity per control step to try. 1: the velocity stays constant.
+        past: (n, window) normalised actions before each of n moments.
+        future: (n, H) normalised actions from each moment on.
+        dampings: Dampings to try: factors of the velocity at each control step. With 1 the velocity stays constant.
 
     Returns:
         The process noise q, for a measurement noise r = 1, and the damping.
@@ -391,8 +392,8 @@ def fit_filters(past: np.ndarray, future: np.ndarray) -> dict[str, Noise]:
     """Fit the Kalman filters `kalman` and `damped`.
 
     Args:
-        past: (n, window, D) normalised actions before each moment.
-        future: (n, H, D) normalised actions after each moment, which the filters should predict.
+        past: (n, window, D) normalised actions before each of n moments.
+        future: (n, H, D) normalised actions from each moment on, which the filters should predict.
 
     Returns:
         For each filter's name, the noise and damping per DoF, strict DoFs included.
@@ -420,10 +421,10 @@ class Matches:
 
 
 def match(store: Datastore, task: str, epsilon: float) -> Matches:
-    """Compare entries of a task with their most similar entries of the task's other episodes (docs/methods.md §4.3).
+    """Compare each datastore entry of a task with the most similar entry of another episode (docs/methods.md §4.3).
 
-    The most similar entry's chunk is the one that would be executed without verification. It is compared with the
-    entry's own chunk, the expert's next actions. At most ENTRIES entries are looked up. With a single episode of the
+    The chunk of the most similar entry would be executed without verification. It is compared with the entry's own
+    chunk, the expert's next actions. At most ENTRIES entries are looked up. With a single episode of the
     task there are no matches.
 
     Args:
@@ -469,8 +470,8 @@ def task_levels(matches: Matches, confidence: float) -> stored.SkipLevel:
     In a rollout, feedback after each episode may move s_min between the bounds `low` and `high`. Each of the three is
     the smallest similarity that keeps the share of wrong chunks within a limit. With a confidence of 0.9 the limits are
     0.1 for s_min, 0.2 (twice as much) for `low`, and 0.033 (a third) for `high`. If no similarity keeps the limit of
-    `high`, `high` is the largest similarity seen. If no similarity keeps the limit of s_min, all three are NEVER, and
-    the task never skips.
+    `high`, `high` is the largest similarity of all matches. If no similarity keeps the limit of s_min, all three
+    are NEVER, and the task never skips.
 
     Args:
         matches: The task's matches.

@@ -125,7 +125,7 @@ def entries_of(target: Any, episode: DemoEpisode, space: ObservationSpace, key: 
         target: The target.
         episode: The episode.
         space: Observation space of the demonstrations.
-        key: Parts of the prompt that make the key.
+        key: Names of the parts of the prompt that form the search key.
 
     Returns:
         The values of each column, one row per entry. The column `keys` holds the encoded observations, and `tokens` the

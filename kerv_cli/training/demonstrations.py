@@ -2,9 +2,10 @@
 
 A command opens one dataset, or several joined datasets.
 
-The scripted expert or a policy acts. If a policy acts, the expert labels the states that it visits (DAgger; Ross,
-Gordon, Bagnell 2011). The policy may decode with any method. For example, `method=scout_unverified` records the states
-that a drafter's chunks lead to without verification, so that the drafter can be trained on them.
+While demonstrations are recorded, the scripted expert or a policy acts. If a policy acts, the expert labels the states
+that the policy visits (DAgger; Ross, Gordon, Bagnell 2011). The policy may decode with any method. For example,
+`method=scout_unverified` records the states that a drafter's chunks lead to without verification, so that the drafter
+can be trained on them.
 """
 
 from __future__ import annotations
@@ -54,8 +55,8 @@ def open_demos(database: Database, names: str, tasks: Sequence[str] = (), episod
     Args:
         database: The database of the results folder.
         names: Name of a dataset, or several names joined by `+`.
-        tasks: Tasks to record if the dataset is missing, for the error message. Empty: the default tasks.
-        episodes: Episodes per task to record, for the error message. 0: the default number.
+        tasks: Tasks that the error message tells to record if the dataset is missing. Empty for the default tasks.
+        episodes: Episodes per task that the error message tells to record. 0 for the default number.
 
     Raises:
         UsageError: A name cannot be the name of a folder.
@@ -82,7 +83,7 @@ def open_demos(database: Database, names: str, tasks: Sequence[str] = (), episod
 
 
 def _remedy(parent: Path, folder: Path, tasks: Sequence[str], episodes: int) -> str:
-    """Return what to type instead of the dataset `folder`, which does not exist; `parent` holds all datasets."""
+    """Return the end of an error message: what to type if `folder` is no dataset. `parent` holds all datasets."""
     if folder.parent != parent:
         return "name a folder that holds manifest.json"
     tasks = [folder.name] if stands_for_tasks(folder.name) else tasks
@@ -205,7 +206,7 @@ class PolicyActor:
     no episode depends on earlier episodes.
 
     Args:
-        decoder_of: Makes the decoder of a task, by the task's name.
+        decoder_of: Function that takes a task's name and makes the decoder of this task.
         expert_share: Share of the chunks in which the expert acts.
     """
 
@@ -242,9 +243,9 @@ class PolicyActor:
 
 @dataclass(frozen=True)
 class PolicyActs:
-    """A function that makes the `PolicyActor` of a recording. The process that records calls it.
+    """A callable that makes the `PolicyActor` of a recording, in the process that records.
 
-    This object holds the settings of the recording and a hash, but no weights.
+    It holds the settings of the recording and a hash, but no weights.
 
     Attributes:
         settings: Settings of the recording.

@@ -102,7 +102,8 @@ def import_drafter(settings: BuildDrafterSettings) -> tuple[Path, dict[str, Any]
     """Run `kerv build drafter`: check that a published drafter fits a target, and copy it into the results folder.
 
     Returns:
-        The drafter's folder, and numbers to print: parameters, layers, positions and mask.
+        The drafter's folder, and facts to print: numbers of parameters and layers, and the conventions `positions` and
+        `mask`.
 
     Raises:
         UsageError: The target does not exist. Or the drafter of a shipped policy would be replaced.

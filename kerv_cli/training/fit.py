@@ -36,7 +36,7 @@ from kerv_cli.worlds.demos.dataset import DemoDataset
 
 Metrics = dict[str, float]
 Loss = Callable[[int], tuple[Tensor, Metrics]]
-"""Takes an optimisation step. Returns the loss (a scalar) of that step's batch, and metrics to log."""
+"""Takes the number of an optimisation step. Returns the loss (a scalar) of that step's batch, and metrics to log."""
 Validate = Callable[[Any], Metrics]
 """Takes the network. Returns metrics on held-out samples. The best weights are those with the highest `score`."""
 Save = Callable[[Any, Metrics], None]
@@ -48,7 +48,7 @@ _UNREADABLE = (OSError, EOFError, RuntimeError, KeyError, TypeError, ValueError,
 NOT_IDENTITY = ("steps", "validate_every", "init", "stored")
 """Optimisation settings that may change when a training resumes.
 
-`init` is among them because the hash of its weights counts instead of its name.
+`init`, a target's name, is among them, because the hash of that target's weights counts instead.
 """
 
 SAME_REQUEST = 2.0
@@ -84,7 +84,7 @@ def fit(
         The metrics of the best weights.
 
     Raises:
-        CheckpointError: The resume file is damaged. Or its training reached `settings.steps` without a validation.
+        CheckpointError: The resume file is damaged, or holds a training with enough steps but without a validation.
         KervError: The training diverged.
         StorageError: The disk cannot be written.
         Interrupted: The process got Ctrl-C or SIGTERM. The current step was finished and the state is saved.
@@ -233,12 +233,13 @@ def check_finite(metrics: Metrics, step: int) -> None:
 
 
 def batches(count: int, settings: TrainSettings, weights: Tensor | None = None) -> Callable[[int], Tensor]:
-    """Return a function that draws the samples of a step's batch. They depend only on `settings.seed` and the step.
+    """Return a function that draws the samples of a step's batch. Only `settings.seed` and the step determine them.
 
     Args:
         count: Number of samples.
         settings: Optimisation settings.
-        weights: (count,) float64. Sample i is drawn in proportion to `weights[i]`. None: all are equally likely.
+        weights: (count,) float64. Sample i is drawn in proportion to `weights[i]`. If None, all samples are
+            equally likely.
 
     Returns:
         The function. It takes the step, and returns the indices (B,) int64 of the samples.
@@ -285,7 +286,8 @@ def without_subnormals() -> Iterator[None]:
 def until_interrupted() -> Iterator[threading.Event]:
     """Turn the first Ctrl-C (SIGINT) or SIGTERM into an event, so that the training can finish its step.
 
-    A later signal raises KeyboardInterrupt. A signal that the process ignores stays ignored.
+    A signal more than SAME_REQUEST seconds later raises KeyboardInterrupt. Signals that the process ignores stay
+    ignored.
 
     Yields:
         The event. The first signal sets it.

@@ -80,7 +80,7 @@ def needs(methods: tuple[str, ...], sees: bool, runnable: bool = True) -> tuple[
     """Return the kinds of artifacts that the methods need, in the order in which they must be made.
 
     Args:
-        methods: Names of methods. Empty: all methods that work with the target.
+        methods: Names of methods. If empty, all methods that work with the target.
         sees: Whether the target has cameras.
         runnable: Whether episodes can run in the target's environment. Some environments exist only as recordings.
 
@@ -120,7 +120,8 @@ def _state(artifacts: Artifacts, database: Database, kind: str, kinds: Sequence[
         kinds: All kinds that the methods need, in the order in which they are made.
 
     Raises:
-        CheckpointError: The artifact is a trained drafter of another target or made from other artifacts.
+        CheckpointError: The artifact is a trained drafter that belongs to another target or was made from other
+            artifacts.
     """
     files, path = kind_of(kind), artifacts.path(kind)
     if not artifacts.exists(kind):

@@ -22,14 +22,14 @@ FIRST_EPISODES = "episodes used per task, lowest seeds first; 0: all"
 
 
 Stage = Callable[[str], AbstractContextManager[Callable[..., None]]]
-"""Takes the title of a part of the work. Returns a context that yields a progress function (done, total)."""
+"""Takes the title of a stage of the work. Returns a context manager that yields a progress function (done, total)."""
 
 Begin = Callable[[str, Path, str, int], Stage]
 """Called once all settings are checked, before the work begins.
 
 It takes the kind and the folder of the artifact, the line that `--plan` prints, and the number of optimisation steps or
-episodes (0: not known). A command passes a function that ends with the plan if `--plan` was typed. Otherwise the
-function notes in the database that the work began.
+episodes (0 if unknown). If `--plan` was typed, the function that a command passes here prints that line and ends the
+command. Otherwise it notes in the database that the work began.
 """
 
 
@@ -190,8 +190,8 @@ class CalibrateSettings(DemonstrationSettings):
     """Settings of `kerv calibrate`, which measures on demonstrations what KERV and HeiSD need (docs/methods.md §3, §4).
 
     It measures four things: the noise of the kinematic predictors; each task's reference level K_S of the kinematic
-    variability; the ranges of curvature and path length, by which HeiSD chooses between retrieval and drafter; and for
-    each task the smallest similarity at which a retrieved draft is executed without verification.
+    variability; the ranges of the hand's curvature and path length, with which HeiSD chooses between retrieval and
+    drafter; and for each task the smallest similarity at which a retrieved draft is executed without verification.
     """
 
     episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)

@@ -47,7 +47,7 @@ from kerv_cli.worlds.demos.files import DemoEpisode
 STATE_EPISODES = 200
 """Maximum number of episodes from which the range of the states is measured."""
 WITHIN = 9
-"""Validation reports the share of tokens at most this many bins from the label: Spec-VLA's acceptance radius."""
+"""Validation reports the share of tokens at most this many bins from the label. It is Spec-VLA's acceptance radius."""
 WAYPOINTS = (Place("waypoint 1", 0), Place("waypoint 2", 0))
 """Positions that a policy estimates if its demonstrations hold no object positions: where the hand will be when the
 gripper next changes, and at the end of the episode. No state contains them, so their index 0 is never used."""
@@ -145,8 +145,8 @@ def refuse_contradictions(settings: TrainTargetSettings) -> None:
 def settle_places(settings: TrainTargetSettings, dataset: DemoDataset) -> None:
     """Check that the demonstrations hold the positions that the policy reads or learns to estimate.
 
-    Without object positions, change `train.places` from `state` to `path`, and say so. The policy then learns where the
-    hand will be.
+    If the demonstrations hold no object positions, `train.places` changes from `state` to `path`, and a line on stderr
+    says so. The policy then learns to estimate where the hand will be.
 
     Raises:
         UsageError: The policy reads object positions, and the demonstrations hold none. Or `train.places=path` is
@@ -206,7 +206,7 @@ def load_training(
     camera: str,
     progress: OnProgress,
 ) -> tuple[CompactTarget, Samples]:
-    """Read the demonstrations into memory, and make the network. It starts from the weights of `init` if given.
+    """Read the demonstrations into memory, and make the network. If `init` is not None, use the weights in that folder.
 
     Raises:
         CheckpointError: The demonstrations or the target `init` are damaged or of another environment.
@@ -269,8 +269,8 @@ def load_samples(
         words: Tokenizer of the instructions.
         task_names: Full names of the tasks.
         progress: Called with two numbers: episodes read, all episodes.
-        waypoints: Number of later positions of the hand that the policy learns to estimate. 0: the policy learns the
-            positions of object and goal instead.
+        waypoints: Number of later positions of the hand that the policy learns to estimate. If 0, the policy learns
+            the positions of object and goal instead.
 
     Raises:
         CheckpointError: An episode has too few actions of the expert, or images of another size.
@@ -330,7 +330,7 @@ def task_weights(tasks: Tensor, balance: float) -> Tensor | None:
 
     Args:
         tasks: (n,) index of each sample's task.
-        balance: 0: all samples are equally likely. 1: all tasks are equally likely.
+        balance: From 0 (all samples are equally likely) to 1 (all tasks are equally likely).
 
     Returns:
         (n,) float64 weights; None if all samples are equally likely.
@@ -373,8 +373,8 @@ class Imitation:
         target: The network to train, already on its device.
         samples: All samples. Some whole episodes are held out for validation.
         settings: Optimisation settings.
-        closed_loop: Runs simulated episodes and returns a target's success in [0, 1], which then dominates the score.
-            None: success is not measured.
+        closed_loop: Function that runs simulated episodes with a target and returns the success in [0, 1]. The success
+            then dominates the score. None if success is not measured.
     """
 
     def __init__(
@@ -403,8 +403,9 @@ class Imitation:
     def precision(self) -> Iterator[None]:
         """Compute in bfloat16 inside this context, if `train.bf16` is set and the device multiplies bfloat16 numbers.
 
-        GPUs do, and CPUs with AMX or AVX512-BF16. Other CPUs are slower in bfloat16. On a CPU, attention then runs
-        without a fused kernel, because the fused kernel's backward pass takes four times as long.
+        GPUs multiply bfloat16 numbers, and so do CPUs with AMX or AVX512-BF16. Other CPUs are slower in bfloat16. In
+        bfloat16 on a CPU, attention runs without a fused kernel, because that kernel's backward pass takes four times
+        as long.
         """
         gpu = self.device.type != "cpu"
         multiplies = gpu or torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported()
@@ -490,8 +491,8 @@ class Imitation:
 def check_init(settings: TargetSettings, camera: str, description: TargetDescription, folder: Path) -> None:
     """Refuse initial weights whose shapes differ from the new target's.
 
-    Only the settings `size`, `chunk`, `code`, `norm` and `parallel` may differ. The new target may see further views
-    after the old ones.
+    Only the settings `size`, `chunk`, `code`, `norm` and `parallel` may differ. The new target may see further camera
+    views after the views of the old target.
 
     Args:
         settings: Shapes of the new target.
@@ -529,7 +530,7 @@ def continued_target(
         settings: Shapes of the new target.
         init: The target with the initial weights.
         camera: Camera of the new target. Several views are joined by `+`.
-        code: Code of the new target's chunks. None: a token for every number.
+        code: Code of the new target's chunks. If None, each number of an action is one token.
     """
     actions = replace(init.actions, code=code)
     target = CompactTarget(replace(settings), actions, init.observation, init.words, camera)
