@@ -25,7 +25,7 @@ class Task:
     Attributes:
         name: Full name. No other environment has a task with this name.
         instruction: Sentence that the policy reads.
-        difficulty: Name of a group of tasks. Tables also show averages over these groups.
+        difficulty: Name of the task's group. Tables of results also show averages over each group.
     """
 
     name: str
@@ -38,11 +38,11 @@ W = TypeVar("W", bound="WorldSettings")
 
 @dataclass(frozen=True, kw_only=True)
 class EnvironmentPart(Part):
-    """An environment. The decorated function returns its `EnvironmentSpec`.
+    """An environment. It decorates the function that returns the environment's `EnvironmentSpec`.
 
     Args:
-        names: Function that returns the names of its suites and tasks without importing numpy. None: the specification
-            names them.
+        names: Function that returns the names of the environment's suites and tasks without importing numpy. If None,
+            the specification gives these names.
     """
 
     kind = "environment"
@@ -62,7 +62,7 @@ def spec_of(task: str) -> EnvironmentSpec:
 
     Raises:
         UnknownName: No environment has the task.
-        UsageError: Several environments have it.
+        UsageError: Several environments have the task.
     """
     owners = [spec for spec in specs().values() if spec.full_name(task) is not None]
     if not owners:
@@ -80,7 +80,7 @@ def instruction_of(task: str) -> str:
 
     Raises:
         UnknownName: No environment has the task.
-        UsageError: Several environments have it.
+        UsageError: Several environments have the task.
     """
     return spec_of(task).task(task).instruction
 
@@ -121,7 +121,7 @@ def stands_for_tasks(name: str) -> bool:
 
 
 def task_names() -> Iterator[str]:
-    """Yield the suites and tasks of all environments, for shell completion."""
+    """Yield the names of the suites and tasks of all environments, for shell completion."""
     for part in EnvironmentPart.every().values():
         if part.names is not None:
             yield from part.names()
@@ -131,7 +131,7 @@ def task_names() -> Iterator[str]:
 
 
 def settled(world: W, spec: EnvironmentSpec) -> W:
-    """Return a world's settings with the environment's default camera and horizon filled in.
+    """Return a world's settings. The environment's defaults replace an empty camera name and a horizon of 0.
 
     Args:
         world: Settings of the world.
@@ -139,7 +139,7 @@ def settled(world: W, spec: EnvironmentSpec) -> W:
 
     Raises:
         UnknownName: The environment has no such camera.
-        UsageError: The horizon is longer than the simulator can run.
+        UsageError: The horizon is longer than the simulator can run, or a view has an impossible field of view.
     """
     camera = replace(world.camera, name=spec.camera_name(world.camera.name))
     return replace(world, camera=camera, horizon=spec.control_steps(world.horizon))

@@ -1,6 +1,6 @@
 """Base class of worlds that MuJoCo simulates, and off-screen drawing of their images.
 
-It uses `mujoco.Renderer` directly. Gymnasium's viewer draws wrong images, without an error, if several environments
+`mujoco.Renderer` draws the images. Gymnasium's viewer draws wrong images, without an error, if several environments
 exist in one process. The module also finds an OpenGL backend that works on this machine.
 """
 
@@ -88,8 +88,8 @@ _INSTALL = f"{'' if os.geteuid() == 0 else 'sudo '}apt-get install -y libegl1 li
 def choose_backend() -> str:
     """Choose an OpenGL backend that works here and return its name. Call it before mujoco is imported.
 
-    The environment variable `MUJOCO_GL` decides if it is set. Otherwise EGL and then OSMesa are tried, each in its own
-    process, so that a broken driver cannot crash this one. Worker processes inherit the choice through `MUJOCO_GL` and
+    If the environment variable `MUJOCO_GL` is set, it decides. Otherwise EGL and then OSMesa are tried, each in its own
+    process, so that a broken driver cannot crash kerv. Worker processes inherit the choice through `MUJOCO_GL` and
     `PYOPENGL_PLATFORM`.
 
     Raises:
@@ -107,7 +107,7 @@ def find_backend() -> tuple[str, str]:
     """Find an OpenGL backend that works here. The search runs once per process.
 
     Returns:
-        The backend's name, empty if there is none; and an error message, empty if there is a backend.
+        The backend's name, which is empty if none works, and an error message, which is empty if one works.
     """
     # Software rendering with a thread pool per context is slower for small frames and crowds out other workers.
     os.environ.setdefault("LP_NUM_THREADS", "0")

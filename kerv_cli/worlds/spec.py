@@ -32,7 +32,7 @@ _LACKS = {
     "model": "its world has no MuJoCo model",
     "range": "its world cannot widen the range of initial states",
 }
-"""What a kind of stress needs from an environment -> error message for an environment that does not offer it."""
+"""Error messages for environments that lack what a kind of stress needs, by the entry of `StressPart.requires`."""
 
 
 @dataclass(frozen=True)
@@ -86,12 +86,12 @@ class EnvironmentSpec:
         horizon: Default number of control steps of an episode, which is also the largest.
         cameras: Names of the cameras. The first is the default.
         world_class: `module:class` of the `World`. Empty for a recorded dataset, in which nothing can be executed.
-        expert_class: `module:class` that is called with (spec, task) and returns an `Expert`. Empty: no experts.
+        expert_class: `module:class`, called with (spec, task) to make an `Expert`. Empty if there are no experts.
         upside_down: Cameras whose raw images must be rotated by 180 degrees.
         suffix: Ending of all full task names. Users may leave it out.
         packages: Python packages whose versions determine the physics. The first one is the simulator's.
-        extra: Extra of kerv that installs the simulator: `pip install 'kerv[EXTRA]'`. Empty: kerv itself installs it.
-        grip: Two values of the gripper's DoF: the one that closes it and the one that opens it. Empty if there is no
+        extra: Extra of kerv that installs the simulator (`pip install 'kerv[EXTRA]'`). Empty if kerv itself does.
+        grip: Value of the gripper's DoF that closes the gripper, then the value that opens it. Empty if there is no
             gripper.
         seeds: Ranges of episode seeds.
         experts: Names of kerv's experts by task, for tasks in which they replace the simulator's experts.
@@ -139,7 +139,7 @@ class EnvironmentSpec:
         return self.suites.get(name.upper()) or ((full,) if full else ())
 
     def camera_name(self, name: str) -> str:
-        """Check a camera's name and return it. If it is empty, return the environment's first camera.
+        """Check a camera's name and return it. If the name is empty, return the environment's first camera.
 
         Args:
             name: One camera, or several views joined by `+`.
@@ -157,7 +157,7 @@ class EnvironmentSpec:
         """Check camera settings and return them. An empty name becomes the environment's first camera.
 
         Args:
-            settings: The settings. None: all defaults.
+            settings: The settings. None stands for all defaults.
 
         Raises:
             UnknownName: The environment has no such camera.
@@ -200,7 +200,7 @@ class EnvironmentSpec:
         """Return the action (D,) that keeps the robot where it is.
 
         Args:
-            opening: Current opening of the gripper, from 0 (closed) to 1 (open). The action keeps it.
+            opening: Current opening of the gripper, from 0 (closed) to 1 (open). The action keeps this opening.
         """
         action = self.actions.middle.copy()
         if self.grip:
@@ -217,10 +217,10 @@ class EnvironmentSpec:
             return False
 
     def check_installed(self, target: str = "NAME") -> None:
-        """Refuse an environment whose simulator is not installed, or not in versions that work.
+        """Refuse an environment whose simulator is not installed, or is installed in versions that do not work.
 
         Args:
-            target: The policy that was to run in it, for the error message.
+            target: Name of the policy that should run in the environment, for the error message.
 
         Raises:
             UsageError: A package is missing or has a wrong version, or the environment is a recorded dataset.
@@ -240,8 +240,8 @@ class EnvironmentSpec:
 
         Args:
             task: Full or short name.
-            camera: Default view of `World.frame`. None: the environment's first camera.
-            horizon: Control steps of an episode. 0: the environment's default.
+            camera: Default view of `World.frame`. If None, the environment's first camera.
+            horizon: Control steps of an episode. 0 stands for the environment's default.
 
         Raises:
             UnknownName: There is no such task or camera.
@@ -293,8 +293,8 @@ class World(ABC):
         Args:
             spec: The environment.
             task: Full or short name of the task.
-            camera: Default view of `frame`. None: the environment's first camera.
-            horizon: Control steps of an episode. 0: the environment's default.
+            camera: Default view of `frame`. If None, the environment's first camera.
+            horizon: Control steps of an episode. 0 stands for the environment's default.
 
         Raises:
             UnknownName: There is no such task or camera.
@@ -352,7 +352,7 @@ class World(ABC):
 
     @property
     def grip_point(self) -> NDArray[np.float64]:
-        """Position (3,) where the hand grips, in metres. It is `end_effector` unless a subclass knows a better one."""
+        """Position (3,) where the hand grips, in metres. The default is `end_effector`."""
         return self.end_effector
 
     @property
@@ -375,7 +375,7 @@ class World(ABC):
         return float(values[names.index("gripper")]) if "gripper" in names else 1.0
 
     def reset(self, seed: int) -> Observation:
-        """Start the episode of a seed. Draw its disturbance, if there is a stress. Return the first observation.
+        """Start the episode of a seed, and return the first observation. A stress draws a new disturbance.
 
         Raises:
             UsageError: The seed is negative.
@@ -420,7 +420,7 @@ class World(ABC):
         The image is sharp and current even if a stress disturbs the images that the policy sees.
 
         Args:
-            camera: The view to draw. None: the world's own view.
+            camera: The view to draw. If None, the world's own view.
 
         Raises:
             RenderingUnavailable: This machine cannot draw.

@@ -28,11 +28,11 @@ Model: TypeAlias = "mujoco.MjModel"
 
 @dataclass(frozen=True, kw_only=True)
 class StressPart(Part):
-    """A kind of stress. The decorated class is a `Stress`.
+    """A kind of stress. It decorates a subclass of `Stress`.
 
     Args:
-        requires: What this kind of stress needs from an environment: entries of `World.stressable`, or `position` for
-            an action space with that group.
+        requires: What this kind of stress needs from an environment: entries of `World.stressable`, or `position` if
+            the action space must have the group `position`.
     """
 
     kind = "stress"
@@ -43,7 +43,7 @@ class ModelChanges(ExitStack):
     """Remembers the original values of arrays of a MuJoCo model. `close` restores them, the last change first."""
 
     def keep(self, *arrays: NDArray[Any]) -> None:
-        """Remember the current values of some arrays of a model. Call it before changing them."""
+        """Remember the current values of some arrays of a model. Call this method before changing the arrays."""
         for array in arrays:
             self.callback(np.copyto, array, array.copy())
 
@@ -57,9 +57,9 @@ class Stress:
     Attributes:
         kind: Name of the kind of stress.
         levels: Size of the disturbance at level 1, 2, ….
-        level: Chosen level. 0: no disturbance.
+        level: Chosen level. 0 means no disturbance.
         amount: The entry of `levels` for the chosen level. None at level 0.
-        spread: Factor by which the range of initial states is widened around its centre. 1: unchanged.
+        spread: Factor by which the range of initial states is widened around its centre. 1 changes nothing.
     """
 
     kind: ClassVar[str] = "none"
@@ -95,7 +95,7 @@ class Stress:
 
         Args:
             model: The model.
-            changes: Call its `keep` with each array before changing the array.
+            changes: Remembers original values. Call `changes.keep` with each array before changing the array.
         """
 
     def act(self, action: Array, step: int) -> Array:
@@ -138,7 +138,7 @@ def factor_or_inverse(random: np.random.Generator, factor: float) -> float:
 
 
 def robot_roots(model: Model) -> Iterator[int]:
-    """Yield the ids of the robots' root bodies. A root is a robot's if an actuator moves it or a body below it."""
+    """Yield the ids of the robots' root bodies: roots for which an actuator moves the root or a body below it."""
     import mujoco
 
     joints = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
@@ -154,11 +154,11 @@ _FROM_MATERIAL = 0.5, 0.5, 0.5, 1.0  # rgba of a geom that takes its colour from
 
 @StressPart("light", requires=("model",))
 class Light(Stress):
-    """All lights are brighter or darker, and lamps (lights with a place in the scene) shine from other directions.
+    """All lights are brighter or darker, and lamps (lights with a position in the scene) shine from other directions.
 
     Each level is (gain, degrees):
 
-    - gain: the strength of all lights is multiplied or divided by it
+    - gain: factor by which the strength of all lights is multiplied or divided
     - degrees: angle by which each lamp is rotated about a random axis through the origin
     """
 
@@ -183,10 +183,10 @@ class Light(Stress):
 
 @StressPart("colour", requires=("model",))
 class Colour(Stress):
-    """Floor, walls and table get random colours, one per body. Sky, robot and objects keep theirs.
+    """Floor, walls and table get random colours, one per body. Sky, robot and objects keep their colours.
 
-    The new colour is a mixture of the old colour and a random one. Each level is the share of the random one. A texture
-    is multiplied by the new colour.
+    The new colour is a mixture of the old colour and a random colour. Each level is the share of the random colour. A
+    texture is multiplied by the new colour.
     """
 
     kind = "colour"
@@ -251,8 +251,8 @@ class Objects(Stress):
     """Objects have another size, mass and friction, and start in a wider range.
 
     Objects are the bodies with their own joints that do not belong to a robot. The size changes only for objects that
-    move freely and have no mesh. The friction of all geoms changes, not only that of objects, because a contact uses
-    the larger of its two frictions. The damping of the objects' joints changes, too.
+    move freely and have no mesh. The friction of all geoms changes, not only of the objects' geoms, because a
+    contact uses the larger friction of the two geoms. The damping of the objects' joints changes, too.
 
     Each level is (size, mass, friction, spread). The first three are factors. In each episode, one random draw per
     factor decides whether the values of all objects are multiplied by the factor or divided by it. `spread` is the
@@ -335,12 +335,12 @@ STUCK_SECONDS = 0.25
 def bursts(
     random: np.random.Generator, per_second: float, seconds: float, control_hz: float
 ) -> Iterator[tuple[bool, bool]]:
-    """Yield for each control step whether a burst runs in it, and whether it begins in it.
+    """Yield two booleans for each control step: whether a burst is running, and whether it begins in this step.
 
     Bursts have a fixed duration and begin at random, one at a time.
 
     Args:
-        random: Draws when a burst begins, once per control step without one.
+        random: Random generator. In each control step without a burst, one draw decides whether a burst begins.
         per_second: Mean number of bursts that begin per second while no burst is running.
         seconds: Duration of a burst.
         control_hz: Control steps per second.
@@ -393,7 +393,7 @@ class Actuation(Stress):
 
     - noise: standard deviation of Gaussian noise, where 1 is half of a DoF's range
     - gain: largest relative error of a DoF's gain, drawn once per episode
-    - stuck: mean number of bursts that begin per second while none is running. In a burst one DoF does not move.
+    - stuck: mean number of bursts that begin per second while no burst is running. In a burst one DoF does not move.
     """
 
     kind = "actuation"
@@ -440,7 +440,7 @@ class Sensor(Stress):
     levels = ((16, 0.5, 0.1), (22, 0.65, 0.15), (30, 0.9, 0.2), (97, 3.0, 0.55))
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """Prepare an episode: forget the images of the previous one."""
+        """Prepare an episode: forget the images of the previous episode."""
         super().begin(task, seed, space)
         self._last: dict[str, NDArray[np.uint8]] = {}
 

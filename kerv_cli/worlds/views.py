@@ -1,6 +1,6 @@
 """Parse the name of a camera, which may stand for several views side by side.
 
-`corner4+gripperPOV:75` means two cameras. The second has its own field of view of 75 degrees.
+`corner4+gripperPOV:75` means two cameras. The second camera has its own field of view of 75 degrees.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class View(NamedTuple):
     Attributes:
         name: This view's part of the full camera name, such as `gripperPOV:75` in `corner4+gripperPOV:75`.
         camera: Name of the camera.
-        fovy: Vertical field of view in degrees. None: the camera settings decide.
+        fovy: Vertical field of view in degrees. If None, the camera settings decide.
     """
 
     name: str
@@ -33,7 +33,7 @@ def views_of(name: str) -> list[View]:
     """Parse a camera's name into its views, from left to right.
 
     Args:
-        name: Views joined by `+`. Empty: one view of the environment's first camera.
+        name: Views joined by `+`. An empty name means one view of the environment's first camera.
 
     Raises:
         UsageError: A view has no camera or an impossible field of view.

@@ -26,7 +26,7 @@ class MetaWorld(StepBenchmark):
     Non-obvious behaviours:
         - An action is 4 numbers in [-1, 1]: hand displacement (1 is 1 cm) and gripper (+1 closes); 80 Hz.
         - An episode ends with the first step at which the task's success flag is set, or at the horizon (500).
-        - Episode i starts from the initial state of seed `seed` + i, which is among the recorded metrics.
+        - Episode i starts from the initial state of seed `seed` + i. Seed and initial state are recorded as metrics.
         - Images are upright; several cameras joined with `+` are one image, side by side.
         - A stress disturbs the world (docs/stress.md). The disturbance is drawn from task and seed.
 
@@ -84,7 +84,7 @@ class MetaWorld(StepBenchmark):
         return [{"name": t.name, "suite": t.difficulty, "instruction": t.instruction, "seed": self.seed} for t in tasks]
 
     def reset(self, task: dict[str, Any]) -> Observation:
-        """Start episode number `episode_idx` of a task."""
+        """Start episode number `task["episode_idx"]` (default 0) of a task, and return the first observation."""
         if self.world is None or self.world.task != task["name"]:
             self.cleanup()
             self.world = self.spec.open_world(task["name"], self.camera, self.horizon)
@@ -121,7 +121,7 @@ class MetaWorld(StepBenchmark):
         """Return an action that does not move the hand.
 
         Args:
-            last_action: The previous action, whose gripper value is kept. None: the gripper is opened.
+            last_action: The previous action, whose gripper value is kept. If None, the gripper is opened.
         """
         action = self.spec.standstill(1.0)
         if last_action is not None:

@@ -18,7 +18,7 @@ from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames, load_episode
 from kerv_cli.worlds.spec import EnvironmentSpec
 
 OnProgress = Callable[[int, int], object]
-"""Reports progress: called with (done, total) after every episode or batch."""
+"""Function that reports progress. It is called with (done, total) after every episode or batch."""
 
 FORMAT = 2
 """Version of the manifest's format."""
@@ -106,7 +106,7 @@ class DemoManifest:
 
 
 def _facts(manifest: DemoManifest) -> dict[str, Any]:
-    """Return what must be equal in datasets that are joined."""
+    """Return the facts that must be equal in all datasets that are joined, by name."""
     spaces = {"action space": manifest.actions, "observation space": manifest.observation}
     return {"environment": manifest.environment, **spaces, "camera": manifest.config["camera"]}
 
@@ -117,7 +117,7 @@ def register_recorded(
     """Register an environment for a dataset that was imported. Nothing can be executed in such an environment.
 
     Args:
-        name: Name of the environment. In capitals, it also names the suite of all tasks.
+        name: Name of the environment. The same name in capitals stands for the suite of all tasks.
         actions: Action space.
         observation: Observation space.
         instructions: The instruction of each task.
@@ -134,7 +134,7 @@ def check_recorded(name: str) -> None:
     """Check that imported data can be registered as an environment with this name.
 
     Raises:
-        UsageError: Another environment has the name.
+        UsageError: A registered environment that is no imported data has this name.
     """
     part = EnvironmentPart.every().get(name)
     if part is not None and part.module != __name__:
@@ -159,7 +159,7 @@ def dataset_hash(tasks: Mapping[str, Any]) -> str:
     """Return the SHA-256 of a text with one line per episode: its task, its seed and the hash of its file.
 
     Args:
-        tasks: The entry `tasks` of a manifest's JSON.
+        tasks: The value of the key `tasks` in a manifest's JSON.
     """
     digest = hashlib.sha256()
     for task, summary in sorted(tasks.items()):
@@ -171,7 +171,7 @@ def dataset_hash(tasks: Mapping[str, Any]) -> str:
 def totals(
     entries: Mapping[str, Sequence[EpisodeEntry]], failed: Mapping[str, Sequence[int]], missing: int
 ) -> dict[str, Any]:
-    """Return the manifest's fields that summarise its episodes, as JSON values.
+    """Return those fields of a manifest that summarise the episodes, as JSON values.
 
     Args:
         entries: The recorded episodes of each task.
@@ -213,8 +213,9 @@ class DemoDataset:
     Attributes:
         path: The dataset's folder.
         manifest: What was recorded.
-        episodes: One entry per episode: dataset by dataset if several were joined, then task by task, then by seed.
-        views: If images show several views side by side, read only this number of them, from the left. 0: all.
+        episodes: One entry per episode, sorted by dataset if several were joined, then by task, then by seed.
+        views: If images show several views side by side, read only this number of them, from the left. If 0,
+            read all.
     """
 
     path: Path

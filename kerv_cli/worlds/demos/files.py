@@ -32,23 +32,23 @@ from kerv_cli.base.files import atomic_path, regular
 FORMAT = "1"
 """Version of the episode files' format."""
 _ARRAYS = ("frame_steps", "states", "labels", "executed")
-"""Arrays of an episode that have the same name in its file. `initial_state` is `rand_vec`, its name in Meta-World."""
+"""Arrays of an episode that have the same name in the file. `initial_state` is called `rand_vec` there."""
 
 
 @dataclass(frozen=True)
 class DemoEpisode:
     """A demonstration of T control steps.
 
-    The episode ends with the first success. If an actor (such as a policy) moved the robot instead of the expert, it
-    may end without success.
+    The episode ends with the first success. If an actor (such as a policy) moved the robot instead of the expert,
+    the episode may end without success.
 
     Attributes:
         task: Full name of the task.
         seed: Seed of the episode.
         perturbed: Whether noise was added to the executed actions, or an actor moved the robot instead of the expert.
         steps: T, the number of control steps.
-        frames: (n, size, size x views, 3) uint8, the recorded images. For an episode that is only saved: an iterator of
-            images.
+        frames: (n, size, size x views, 3) uint8, the recorded images. An episode that will only be saved may have an
+            iterator of images instead.
         frame_steps: (n,) int64. Image i was drawn before the action of control step `frame_steps[i]`.
         states: (T, s) float32, privileged state before each action. It begins with the proprioception.
         labels: (T + tail, D) float32, the expert's actions for D DoFs, clipped and without noise. The expert executed
@@ -77,14 +77,14 @@ class DemoEpisode:
 def save_episode(path: Path, episode: DemoEpisode, level: int = 6) -> None:
     """Write an episode to a file, atomically.
 
-    The PNG files of all images are stored end to end in one tensor. Another tensor holds their n + 1 offsets. Memory
-    holds one image at a time: the PNG files wait in a temporary file until their sizes are known.
+    The PNG files of all images are stored end to end in one tensor. Another tensor holds the n + 1 byte offsets of the
+    n files. Memory holds one image at a time: the PNG files wait in a temporary file until their sizes are known.
 
     Args:
         path: The file.
         episode: The episode.
         level: Compression of the images, from 1 (five times as fast, 7 % more bytes) to 9. Equal recordings must have
-            equal bytes, so they always use the default.
+            equal bytes, so recordings always use the default.
 
     Raises:
         StorageError: Writing failed.
@@ -169,8 +169,8 @@ class EncodedFrames:
 
     Attributes:
         files: Episode files, which contain the images as PNG files.
-        spans: (n, 3) int64. For each image: index into `files`, position of the PNG's first byte, position after its
-            last.
+        spans: (n, 3) int64. For each image: index into `files`, position of the PNG's first byte, position after the
+            PNG's last byte.
         size: Height in pixels.
         width: Width in pixels. A wider PNG is cut off at the right.
     """
@@ -180,7 +180,7 @@ class EncodedFrames:
 
     @classmethod
     def joined(cls, parts: Sequence[EncodedFrames]) -> EncodedFrames:
-        """Return the images of all parts, in order. All parts must have the same size."""
+        """Return the images of all parts, in order. All images must have the same size."""
         files: list[Path] = []
         spans = []
         for part in parts:
@@ -252,7 +252,7 @@ _WIDTHS = {"BOOLEAN": 1, "INT32": 4, "FLOAT": 4, "INT64": 8, "DOUBLE": 8, "INT96
 def memory_limit(size: int) -> Iterator[None]:
     """Let this process take at most `size` more bytes of memory inside the `with` block.
 
-    A file of any origin may need more memory than it states. Outside Linux this does nothing.
+    A file of unknown origin may need more memory than it declares. Outside Linux this does nothing.
 
     Raises:
         MemoryError: The code inside the block needs more memory.
@@ -277,8 +277,9 @@ def foreign_table(source: Path | bytes, columns: Sequence[str] = (), most: int =
 
     Args:
         source: The file's path or its bytes.
-        columns: Names of the columns to read. Names that the file lacks are ignored. Empty: all columns.
-        most: Largest size of all rows in memory, in bytes. 0: MOST_EXPANDED.
+        columns: Names of the columns to read. Names that the file lacks are ignored. If empty, read all
+            columns.
+        most: Largest size of all rows in memory, in bytes. 0 stands for MOST_EXPANDED.
 
     Raises:
         OSError: The file is missing or is no Parquet file.
@@ -312,8 +313,8 @@ def _expanded(metadata: pq.FileMetaData, group: int, columns: Sequence[str]) -> 
     """Estimate from the file's metadata how much memory some columns of a row group take.
 
     Returns:
-        size: Largest number of bytes of all these columns. Repeated text counts once, unless it is in lists.
-        text: Number of bytes of the columns with text or binary data. Repeated text counts once. At least 1.
+        size: Upper estimate for all these columns, in bytes. Repeated text counts once, unless it is in lists.
+        text: Estimate for the columns with text or binary data, in bytes. Repeated text counts once. At least 1.
     """
     chunks, rows = metadata.row_group(group), metadata.row_group(group).num_rows
     total, text = _LEAST_ROW * rows, 1

@@ -45,15 +45,15 @@ Row: TypeAlias = Mapping[str, Any]
 
 VECTORS = (ACTION, EXECUTED, STATE, ENVIRONMENT)
 MOST_NUMBERS = 65_536
-"""Largest size of an action or a state: numbers per control step."""
+"""Largest number of values in the action or the state of one control step."""
 MOST_NAMED = 2**26
 """Largest size of a table of episodes or tasks in memory, in bytes."""
 MOST_EPISODES = 2**18
 """Largest number of episodes of a dataset."""
 ALLOWED = 2**27
-"""Bytes in memory that the rows, pictures or video frames of any file may take, however small it is."""
+"""Bytes in memory that the rows, pictures or video frames of any file may take, however small the file is."""
 ROWS_RATIO, PICTURES_RATIO, VIDEO_RATIO = 8, 64, 2048
-"""Bytes in memory that rows, pictures and video frames may take per byte of their file. Any file may take ALLOWED."""
+"""Bytes in memory that rows, pictures and video frames may take per byte of their file, but at least ALLOWED."""
 EPISODE_BYTES, FEW_EPISODES = 1024, 500
 """A data file with more than FEW_EPISODES episodes is refused if it has fewer than EPISODE_BYTES bytes per episode."""
 _MEMORY = 3 * 2**29  # bytes, beyond what the process has
@@ -75,7 +75,7 @@ class Source:
         tasks: The instructions by `task_index`, the number of a task.
         camera: Name of the camera to read.
         key: Name of the feature with the camera's images.
-        taken: Bytes in memory that the images of each file take.
+        taken: Bytes in memory that the images read from each file so far take.
     """
 
     folder: Path
@@ -92,7 +92,7 @@ class Source:
 
         Args:
             folder: Folder of the dataset.
-            camera: Camera to read. Empty: the first.
+            camera: Camera to read. If empty, the first camera.
 
         Raises:
             UsageError: `folder` is a file.
@@ -215,7 +215,7 @@ class Source:
 
 
 def allowed(path: Path, ratio: int) -> int:
-    """Return how many bytes the contents of a file may take in memory, at `ratio` bytes per byte of the file."""
+    """Return how many bytes a file's contents may take in memory: `ratio` times its size, but at least ALLOWED."""
     return max(ALLOWED, ratio * path.stat().st_size)
 
 
@@ -250,7 +250,7 @@ def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProg
 
 
 def _import(source: Source, settings: DemosImportSettings, folder: Path, progress: OnProgress) -> None:
-    """Write the demonstrations into an empty folder. `import_lerobot` explains the other arguments.
+    """Write the demonstrations into an empty folder.
 
     Args:
         source: The LeRobot dataset.
@@ -259,7 +259,7 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
         progress: Called after every episode.
 
     Raises:
-        UsageError: The dataset does not fit the environment or the names of DoFs, or its name is taken.
+        UsageError: The dataset does not fit the environment or the names of DoFs, or another environment has its name.
         UnknownName: There is no such environment, or the dataset has no such strict DoF.
         CheckpointError: A file is damaged, too large, or holds too many episodes for its size.
     """
@@ -323,7 +323,7 @@ def _world_of(source: Source, settings: DemosImportSettings) -> EnvironmentSpec 
 
     Raises:
         UnknownName: There is no such environment, or it has no such camera.
-        UsageError: The dataset has another number of DoFs than the environment, or another rate.
+        UsageError: The dataset has another number of DoFs or another control rate than the environment.
     """
     if not settings.environment:
         return None
@@ -341,8 +341,8 @@ def _world_of(source: Source, settings: DemosImportSettings) -> EnvironmentSpec 
 def _observation(source: Source, state: int, world: EnvironmentSpec) -> ObservationSpace:
     """Return the observation space of a dataset that was recorded in an environment.
 
-    If the dataset holds the whole state, it is the environment's space. If it holds only the robot's own state, it is
-    the environment's space reduced to the proprioception.
+    If the dataset holds the whole state, the result is the environment's space. If the dataset holds only the robot's
+    own state, the result is the environment's space reduced to the proprioception.
 
     Args:
         source: The dataset.
@@ -430,7 +430,7 @@ def action_space(source: Source, settings: DemosImportSettings, actions: np.ndar
 def _groups(names: Sequence[str], strict: Sequence[str]) -> tuple[Group, ...]:
     """Divide the DoFs into groups.
 
-    If there are seven and only the last is strict, the groups are position, rotation and gripper. Otherwise,
+    If there are seven DoFs and only the last one is strict, the groups are position, rotation and gripper. Otherwise,
     neighbouring DoFs of the same sort (strict or not strict) form one group.
     """
     if len(names) == 7 and tuple(strict) == tuple(names[-1:]):
@@ -445,11 +445,11 @@ def _task_names(tasks: Mapping[int, str], world: EnvironmentSpec | None) -> dict
     """Return the names of a dataset's tasks by `task_index`.
 
     If the data belong to an environment of kerv, each name is the environment's task with the same instruction.
-    Otherwise it is made from the instruction, in small letters and digits joined by `-`.
+    Otherwise each name is made from the instruction, in small letters and digits joined by `-`.
 
     Args:
         tasks: The instructions by `task_index`.
-        world: The environment. None: the tasks belong to no environment of kerv.
+        world: The environment. None if the tasks belong to no environment of kerv.
 
     Raises:
         UsageError: The environment has no task with this instruction.
@@ -523,12 +523,12 @@ def _vectors(table: pa.Table, name: str) -> np.ndarray:
 
 
 def _pictures(cells: pa.ChunkedArray, folder: Path, path: Path) -> Iterator[np.ndarray]:
-    """Yield the decoded images (height, width, 3) uint8 of the cells of a table.
+    """Yield the decoded image (height, width, 3) uint8 of each cell in a column of a table.
 
-    A cell holds an image's bytes or its path below `folder`.
+    A cell holds the image's bytes, or the image's path below `folder`.
 
     Args:
-        cells: The cells.
+        cells: The column.
         folder: Folder of the dataset.
         path: File of the table.
 

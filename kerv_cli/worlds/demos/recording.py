@@ -42,7 +42,7 @@ from kerv_cli.worlds.vectors import unit_vector
 
 _SEEDS_PER_JOB = 10  # seeds of a job share one simulator
 _EXTRA_SEEDS = 20
-"""At most this many failed seeds of a task, plus one per requested episode, are replaced by further seeds."""
+"""A task gets at most this many further seeds, plus one per requested episode, to replace failed seeds."""
 
 
 @dataclass(frozen=True)
@@ -53,13 +53,14 @@ class DemoConfig:
         tasks: Tasks and suites of one environment.
         episodes: Number of successful episodes per task.
         first_seed: First seed of every task. It must be a training seed.
-        perturbed: Share of episodes that are executed with noise. `is_perturbed` says which episodes they are.
+        perturbed: Share of episodes that are executed with noise. `is_perturbed` chooses these episodes.
         camera: View of the recorded images. Default: the environment's first camera.
         frame_stride: Record an image at every n-th control step.
         tail: Number of labels to record after the success. Action chunks that begin near the end need them.
         workers: Number of processes. The result does not depend on it.
-        horizon: Number of control steps within which the expert must succeed. 0: the environment's default.
-        policy: Hash of the actor's weights. Empty if the expert moves the robot.
+        horizon: Number of control steps within which the expert must succeed. 0 stands for the environment's
+            default.
+        policy: Hash of the actor's method and weights. Empty if the expert moves the robot.
         expert_share: Probability that the expert, not the actor, executes a chunk of actions.
     """
 
@@ -114,12 +115,11 @@ def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None)
         world: World of the task.
         seed: Seed of the episode.
         config: What to record.
-        actor: Moves the robot. None: the expert does.
+        actor: Moves the robot. If None, the expert moves it.
 
     Returns:
-        The episode, or None if the expert did not succeed in time. Two limits hold: `config.horizon` steps, and the
-        simulator's own horizon minus the `config.tail` steps that follow the success. An actor's episode is always
-        returned.
+        The episode. None if the expert did not succeed within `config.horizon` control steps, or not early enough for
+        the simulator to run the `config.tail` steps after the success. An actor's episode is always returned.
     """
     expert = world.spec.expert(world.task)
     observation = world.reset(seed)
@@ -174,7 +174,7 @@ def record(
         config: What to record.
         out: The dataset's folder.
         on_progress: Called after every few episodes.
-        make_actor: Creates the actor that moves the robot. None: the expert does.
+        make_actor: Creates the actor that moves the robot. If None, the expert moves it.
 
     Returns:
         The manifest, as written to `out/manifest.json`.
@@ -203,10 +203,10 @@ def record(
 def _collect(
     config: DemoConfig, out: Path, on_progress: OnProgress, make_actor: MakeActor | None
 ) -> tuple[dict[str, list[EpisodeEntry]], dict[str, list[int]]]:
-    """Record all episodes, and further seeds for those in which the expert fails.
+    """Record all episodes. For each seed in which the expert fails, record a further seed.
 
     Returns:
-        Two dictionaries by task: the entries of its episodes for the manifest, and the seeds in which the expert
+        Two dictionaries by task: the manifest's entries of the task's episodes, and the seeds in which the expert
         failed.
     """
     entries: dict[str, list[EpisodeEntry]] = {task: [] for task in config.tasks}
@@ -310,10 +310,10 @@ def _run_jobs(
 def _record_seeds(
     config: DemoConfig, out: Path, task: str, seeds: Sequence[int], make_actor: MakeActor | None
 ) -> tuple[str, _Outcomes]:
-    """Record a task's episodes of `seeds`, except those with a file. Runs in a worker process.
+    """Record a task's episodes for these seeds, except those that are on disk already. Runs in a worker process.
 
     Returns:
-        The task's name; and for each seed the manifest's entry of its episode, or None if the expert failed.
+        The task's name, and for each seed the manifest's entry of the episode, or None if the expert failed.
     """
     actor, outcomes = make_actor(config) if make_actor else None, _Outcomes()
     with config.spec.open_world(task, config.camera) as world:
@@ -341,7 +341,7 @@ BURST_PROBABILITY = 0.02
 
 
 def is_perturbed(seed: int, fraction: float) -> bool:
-    """Return whether the episode of a seed is executed with noise. Such seeds are spread evenly.
+    """Return whether the episode of a seed is executed with noise. The seeds with noise are spread evenly.
 
     Args:
         seed: Seed of the episode.

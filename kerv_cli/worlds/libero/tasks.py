@@ -15,7 +15,7 @@ _WHERE = (
     "on the wooden cabinet",
 )
 INSTRUCTIONS: dict[str, str] = {}
-"""Name of a task -> its instruction."""
+"""Instruction of each task, by the task's name."""
 
 for _place in _WHERE:
     _name = _place.replace(" the", "").replace("the ", "").replace(" ", "-")

@@ -36,9 +36,9 @@ _STILL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 _DOWN = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """Axes of a hand that points straight down."""
 _OPEN = 0.08
-"""Distance of the fingers of an open gripper, in metres."""
+"""Distance between the fingers of an open gripper, in metres."""
 _NOISE = 0.02
-"""Standard deviation of the arm's joint angles at the start, in radians. The benchmark's states already contain it."""
+"""Standard deviation of the arm's joint angles at the start, in radians. The benchmark's states already have it."""
 
 
 @functools.cache
@@ -83,7 +83,7 @@ class Libero(MujocoWorld):
         """Build the simulator, which takes about ten seconds.
 
         Raises:
-            RenderingUnavailable: No OpenGL backend works here. robosuite does not import without one.
+            RenderingUnavailable: No OpenGL backend works here. robosuite cannot be imported without a backend.
         """
         choose_backend()
         logging.getLogger("robosuite_logs").setLevel(logging.ERROR)  # it asks for a file of private settings
@@ -179,7 +179,7 @@ _SIDES = {
     "bowl-on-wooden-cabinet": _RIGHT,
     "bowl-in-top-drawer-of-wooden-cabinet": _ALONG_DRAWER,
 }
-"""Task -> side of the rim that nothing blocks, as a direction from the bowl's centre, in degrees around the z axis."""
+"""Side of the rim that nothing blocks, by task: direction from the bowl's centre in degrees around the z axis."""
 _HIGH = ("bowl-on-wooden-cabinet", "bowl-in-top-drawer-of-wooden-cabinet")
 
 _RIM = 0.05
@@ -187,13 +187,13 @@ _RIM = 0.05
 _LOW = 0.02
 """Height of the fingertips above the bowl's origin at the grasp, in metres."""
 _ABOVE = 0.1
-"""Height above the grasp at which the hand arrives, in metres. It is higher while the hand is far away."""
+"""Height above the grasp at which the hand arrives, in metres. The hand moves higher while it is far away."""
 _CARRY = 0.15, 0.28
-"""Height of the carried bowl above the plate, in metres: from the table, and from the cabinet."""
+"""Height of the carried bowl above the plate, in metres, for bowls from the table and from the cabinet."""
 _HELD = 0.2
-"""Opening of the gripper below which the fingers hold the rim."""
+"""Opening of the gripper (0 closed, 1 open) below which the fingers hold the rim."""
 _GAIN, _TURN = 40.0, 6.0
-"""Action per metre and per radian of distance."""
+"""Action per metre of distance, and per radian of rotation."""
 
 
 class LiberoExpert:

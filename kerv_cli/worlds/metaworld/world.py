@@ -1,7 +1,8 @@
 """Run Meta-World's tasks and scripted experts as kerv's worlds and experts.
 
 Meta-World ignores the seed in `env.reset(seed=...)`. The initial state alone determines an episode: the placement of
-object and goal (`rand_vec` in Meta-World). Meta-World's benchmark `MT1(task, seed // 50)` has the initial states.
+object and goal (`rand_vec` in Meta-World). The initial state for kerv's seed s is number s % 50 of Meta-World's
+benchmark `MT1(task, s // 50)`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ _TASKS_PER_BENCHMARK = 50
 def _placements(task: str, benchmark_seed: int) -> tuple[Any, ...]:
     """Return the 50 initial states (`metaworld.Task`) of `MT1(task, benchmark_seed)`.
 
-    It takes up to 1 s because Meta-World resets the task 100 times.
+    A call takes up to 1 s, because Meta-World resets the task 100 times. Results are cached.
     """
     load_mujoco()
     import metaworld
@@ -62,7 +63,7 @@ class MetaWorld(MujocoWorld):
 
     @property
     def grip_point(self) -> NDArray[np.float64]:
-        """Position (3,) between the fingertips, in metres. The end effector is 4.5 cm above it."""
+        """Position (3,) between the fingertips, in metres. The end effector is 4.5 cm above this point."""
         return np.array(self._env.tcp_center, dtype=np.float64)
 
     def _start(self, seed: int) -> NDArray[np.float64]:
@@ -156,21 +157,22 @@ GAIN = 15.0
 class HandlePullSide:
     """Grips the handle, lifts it slowly, and grips again if it slips.
 
-    Meta-World's expert lifts at full speed, so the handle slips through the fingers. Once its hand is more than 3 cm
-    above the handle, it goes down with closed fingers and presses the handle back. kerv's expert derives the phase of
-    the movement from the gripper's opening. So each action depends only on the current state.
+    Meta-World's expert lifts at full speed, so the handle slips through the fingers. Once the hand is more than 3 cm
+    above the handle, that expert goes down with closed fingers and presses the handle back. kerv's expert derives the
+    phase of the movement from the gripper's opening. So each action depends only on the current state.
     """
 
     above = 0.1
     """Height above the handle at which the hand approaches, in metres."""
     far, near = 0.04, 0.02
-    """Horizontal distances from the handle in metres. Beyond `far` the hand first rises, beyond `near` it stays up."""
+    """Horizontal distances from the handle, in metres. Farther than `far` the hand rises. Farther than `near` a raised
+    hand stays up."""
     slipped = 0.05
     """Height of the hand above the handle beyond which the fingers do not hold it, in metres."""
     low = 0.005
     """Height of the hand above the handle at which the fingers close, in metres."""
     shut = 0.66
-    """Opening of the gripper below which the fingers hold the handle."""
+    """Opening of the gripper (0 closed, 1 open) below which the fingers hold the handle."""
     lift = 0.4
     """Upward action while lifting. It must be small: the handle's damping resists in proportion to the speed."""
 
@@ -200,11 +202,11 @@ class PegInsertSide:
     above = 0.15
     """Height above the peg at which the hand approaches, in metres."""
     aside = 0.04
-    """Horizontal distance from the peg beyond which the hand first moves above it, in metres."""
+    """Horizontal distance from the peg beyond which the hand first moves above the peg, in metres."""
     held = 0.04
-    """The peg counts as being in the fingers if it is at most this far below the hand, in metres."""
+    """Largest distance of the peg below the hand at which the fingers may hold the peg, in metres."""
     open, shut = 0.6, 0.4
-    """Openings of the gripper. Above `open` the hand may go down. Below `shut` the fingers hold the peg."""
+    """Openings of the gripper (1 is open). Above `open` the hand may go down. Below `shut` the fingers hold the peg."""
     aligned = 0.03
     """Distance from the hole's axis within which the peg may be inserted, in metres."""
     carry = 0.7
@@ -242,4 +244,4 @@ OURS: Mapping[str, Callable[[], HandlePullSide | PegInsertSide]] = {
     "handle-pull-side-v3": HandlePullSide,
     "peg-insert-side-v3": PegInsertSide,
 }
-"""Task -> class of the expert that replaces Meta-World's."""
+"""Class of the expert that replaces Meta-World's expert, by task."""
