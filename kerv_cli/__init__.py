@@ -1,6 +1,7 @@
 """kerv as a library: `import kerv_cli as kerv`.
 
-Its names are those of `kerv_cli.api`, which is imported when one of them is first used. This import loads nothing.
+The names come from `kerv_cli.api`. That module is imported when one of the names is first used. `import kerv_cli`
+itself loads nothing.
 """
 
 from __future__ import annotations

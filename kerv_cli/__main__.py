@@ -35,15 +35,15 @@ _UNSAFE = ("<frozen importlib", f"{os.sep}sqlalchemy{os.sep}", f"{os.sep}context
 process, if C++ code is running Python. An exception in SQLAlchemy, or between a context manager's `yield` and the
 `with` block, can leave a transaction open. Then this process itself keeps the database locked."""
 _WAIT_SECONDS = 3.0
-"""Longest wait for the end of such code. Some takes much longer: the import that compiles for this CPU."""
+"""Longest wait for code that must not be interrupted, in seconds. The import that compiles kernels takes longer."""
 _deadline = 0.0
-"""Time at which such code is ended, seconds. 0: no signal came while it ran."""
+"""Time of `time.monotonic` after which a signal ends code that must not be interrupted. 0 if no signal waits."""
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
     """Raise KeyboardInterrupt. If the running code must not be interrupted, send the signal again a little later.
 
-    If that code goes on for too long, end the process at once. The database shows its command as interrupted then.
+    If that code goes on for too long, end the process at once. The database then shows the command as interrupted.
     """
     global _deadline
     while frame is not None:
@@ -78,8 +78,8 @@ def _unraisable_at_the_end(unraisable: "sys.UnraisableHookArgs") -> None:
 def _ask_again(number: int) -> None:
     """Send a signal again a few milliseconds later.
 
-    The kernel's timer sends it. A thread could do so only while the main thread waits in C code, which is always in the
-    same few places: the signal could come at a bad moment each time.
+    The kernel's timer sends the signal. A thread could send it only while the main thread waits in C code. The main
+    thread always waits in the same few places, so the signal could come at a bad moment each time.
     """
     signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(number))
     signal.setitimer(signal.ITIMER_REAL, 0.005)

@@ -40,7 +40,7 @@ TABLES = ("settings", "tasks", "episodes")
 
 @dataclass(frozen=True)
 class Study:
-    """The complete episodes of a sweep or a rollout. Each call of a method reads them from the database again.
+    """The complete episodes of a sweep or a rollout. Each call of a method reads the episodes from the database again.
 
     Attributes:
         store: The study in the database.
@@ -121,7 +121,7 @@ def rollout(*overrides: str, grid: bool = False, **settings: object) -> Study:
 def sweep(study: str | Path, *overrides: str, **settings: object) -> Study:
     """Run the missing episodes of a study, as `kerv sweep` does.
 
-    A study compares several settings. Each runs on every task with the same seeds, and they take turns.
+    A study compares several settings. Each setting runs on every task with the same seeds. The settings take turns.
 
     Args:
         study: Name of a file in conf/study, or the path of such a file.
@@ -132,7 +132,7 @@ def sweep(study: str | Path, *overrides: str, **settings: object) -> Study:
         UsageError: A setting or a policy does not exist, or a value is impossible.
         CheckpointError: A policy is damaged, or an artifact that a method needs is missing or damaged.
         Interrupted: The user pressed Ctrl-C. Complete episodes are kept.
-        KervError: Some episodes failed. The others are kept.
+        KervError: Some episodes failed. All complete episodes are kept.
     """
     with chosen_store(as_overrides(f"study={study}", *overrides, **settings)) as typed:
         resolved = resolve(typed)
@@ -151,7 +151,8 @@ def load_study(name: str, results: str | Path = "results", store: str = "") -> S
     Args:
         name: The study's name or a unique part of the name, `last` for the newest, or the path of a study's file.
         results: Folder that kerv writes to.
-        store: URL of the database. Empty: the environment variable KERV_STORE, else SQLite in the folder.
+        store: URL of the database. If empty, the environment variable KERV_STORE gives the URL. If that is empty, too,
+            the database is an SQLite file in `results`.
 
     Raises:
         UsageError: Nothing matches the name, several entries match, or the match is no sweep or rollout.
@@ -209,13 +210,13 @@ class Policy:
                     by side. With a single camera the key can be `observation/image`.
                 `observation/state`: The numbers that `info` names, or the whole state. Positions are in metres.
                 `prompt`: The instruction.
-            executed: Number of actions of the last answer that were executed. None: all of them.
+            executed: Number of actions of the last answer that were executed. If None, all were executed.
 
         Returns:
             (h, D) float64 actions in environment units, to execute one per control step. h is at most H.
 
         Raises:
-            UsageError: A value is missing, has a wrong shape or type, or is not finite. The message names it.
+            UsageError: A value is missing, has a wrong shape or type, or is not finite. The message names the value.
         """
         extra = {} if executed is None else {EXECUTED: executed}
         self.last = self._client.act({**observation, **extra, RESET: self._begins})
@@ -227,7 +228,7 @@ class Policy:
 def load_policy(
     target: str = "mt10-vision", *overrides: str, method: str = "one_pass", task: str = "", **settings: object
 ) -> Policy:
-    """Load a policy that turns observations into actions. It is warmed up, so the first answer is not slower.
+    """Load a policy that turns observations into actions, and warm it up so that the first answer is not slower.
 
     Args:
         target: Name of a trained or shipped policy, or the path of its folder.
