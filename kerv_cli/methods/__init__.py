@@ -1,16 +1,16 @@
 """Decoding methods, with one file or folder per family (docs/methods.md).
 
     ar                          autoregressive decoding (AR): no drafts
-    spec_vla                    Spec-VLA: accept a draft token if it is equal, or within a radius of the target's
-    eagle                       EAGLE-2: drafters that read the target's hidden states, our own and published ones
+    spec_vla                    Spec-VLA: accept a draft token that equals the target's token, or is at most r bins off
+    eagle                       EAGLE-2: our own and published drafters, which read the target's hidden states
     early                       ours: the early drafter and the scout draft a chunk before the prefill
     kerv                        KERV: predictions from the motion, and thresholds that follow the motion
-    unverified                  OpenVLA-OFT's parallel pass, SP-VLA's regression; ours: streaks of drafts
+    unverified                  tokens without verification: OpenVLA-OFT's parallel pass, drafts, SP-VLA's regression
     heisd                       HeiSD: retrieved drafts, a boundary between two drafters, skipped verification
     reuse                       Jacobi decoding as in PD-VLA, and prompt lookup in the last chunk's tokens
     merged                      ours: several drafts in one tree, before the prefill (`method=one_pass`)
-    motion                      ours: acceptance and stopping for FAST tokens, by the motion that they stand for
-    certified                   ours: unverified drafts, on tasks for which a certificate limits the loss of success
+    motion                      ours: accept FAST tokens, and stop decoding, by the motion that the tokens stand for
+    certified                   ours: skip verification on tasks for which a certificate limits the loss of success
 
 Each file above, and the `__init__.py` of each folder, contains the parts of its family, with their settings. Importing
 these files imports neither torch nor numpy. Code that needs torch or numpy, such as a drafter's network, is in another
@@ -18,9 +18,9 @@ file, which is imported when the part is built.
 
 *Ours* marks what comes from no paper.
 
-`compose.py` builds a decoder from a method's parts. `context.py` is the context in which a part is built.
-`artifacts.py` finds, checks and loads files. `drafters.py` is the base of drafters with weights. `calibration.py` is
-the file of calibrated numbers that KERV and HeiSD share.
+`compose.py` builds a decoder from a method's parts. `context.py` defines the context in which a part is built.
+`artifacts.py` finds, checks and loads files. `drafters.py` has the base class of drafters with weights.
+`calibration.py` describes the file of calibrated numbers that KERV and HeiSD share.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Register the parts of autoregressive decoding, which has no drafts and skips no decode (docs/methods.md §1)."""
+"""Register the parts of autoregressive decoding, in which the target decodes every token (docs/methods.md §1)."""
 
 from __future__ import annotations
 

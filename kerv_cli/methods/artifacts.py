@@ -60,7 +60,7 @@ class MadeFor:
     Attributes:
         sha256: Hash of the target's weights.
         actions: The target's action space.
-        chunk: The target's number of control steps per chunk. 0: the artifact works with any number.
+        chunk: The target's number of control steps per chunk. If 0, the artifact works with any number.
     """
 
     sha256: str
@@ -69,7 +69,7 @@ class MadeFor:
 
     @classmethod
     def of(cls, target: TargetDescription) -> MadeFor:
-        """Return what identifies the target with this description."""
+        """Return the hash, the action space and the chunk length from a target's description."""
         return cls(target.origin["sha256"], target.actions, target.chunk)
 
 
@@ -107,9 +107,9 @@ class Artifact(Generic[T]):
     Attributes:
         kind: Name of the kind in settings and paths, such as `drafter`.
         noun: Name of the kind in messages, such as `early drafter`.
-        made: How such an artifact is made, in messages, such as `trained`.
+        made: Word that messages use for how such an artifact was made, such as `trained`.
         command: Command-line arguments after `kerv` that make such an artifact. Empty if no command makes it.
-        schema: Dataclass of the description.
+        schema: Dataclass with the fields of the JSON file.
     """
 
     kind: str
@@ -124,7 +124,7 @@ class Artifact(Generic[T]):
         return f"run 'kerv {' '.join(self.command)}'"
 
     def anew(self, path: Path) -> str:
-        """Return how to replace the artifact in `path`, which was made for another target, for error messages."""
+        """Return advice for an error message: how to replace the artifact in `path`, made for another target."""
         return self.again
 
     def path(self, results: str, name: str | None, target: Path) -> Path:
@@ -132,7 +132,7 @@ class Artifact(Generic[T]):
 
         Args:
             results: The results folder.
-            name: Name of the artifact, or a path. None: the artifact beside the target.
+            name: Name of the artifact, or a path. If None, the artifact is beside the target.
             target: Folder of the target.
         """
         return artifact_or_path(results, self.kind, name) if name else beside(target, self.kind)
@@ -152,7 +152,7 @@ class Artifact(Generic[T]):
         return self.checked(path, artifacts.description)
 
     def made_for(self, description: T) -> MadeFor:
-        """Return what identifies the target that the artifact was made for."""
+        """Return the hash, action space and chunk length of the target that the artifact was made for."""
         fields: Any = description
         return MadeFor(fields.target, fields.actions, fields.chunk)
 
@@ -235,7 +235,7 @@ class Artifacts:
     Args:
         results: The results folder.
         policy: Names of the target and the artifacts.
-        search: Settings of the search in a datastore. None: exact search.
+        search: Settings of the search in a datastore. If None, the search is exact.
         device: Device to load the weights to.
         dtype: Number format to convert the weights to.
 
@@ -296,7 +296,7 @@ class Artifacts:
 
         Args:
             kinds: Kinds of the artifacts.
-            use: The method and the world that they will be used in. None: do not check the use.
+            use: The method and the world that the artifacts will be used in. If None, the use is not checked.
 
         Returns:
             The hashes, by kind, of the target, the artifacts of `kinds` and the further artifacts that they need.

@@ -1,4 +1,4 @@
-"""Register the calibration, whose numbers KERV and HeiSD read."""
+"""Register the kind of artifact `calibration`, a file of measured numbers that KERV and HeiSD read."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from kerv_cli.base.registry import ArtifactPart
 # it has a section for a drafter and one for a datastore
 @ArtifactPart("calibration", needs=("drafter", "datastore"), by_task=True, needs_task=True)
 def artifact() -> type:
-    """Import and return the class that makes and loads calibrations."""
+    """Import and return the class that finds, checks and loads calibrations."""
     from kerv_cli.methods.calibration import CalibrationArtifact
 
     return CalibrationArtifact

@@ -29,7 +29,7 @@ class Demonstrations:
 
     Attributes:
         sha256: Hash of the demonstrations.
-        tasks: Number of episodes of each task. For example, {"training": 50} stands for 50 training episodes.
+        tasks: For each task, by its full name: `{"training": n}`, where n is its number of training episodes.
     """
 
     sha256: str
@@ -54,15 +54,15 @@ class Variability:
 
 @dataclass(frozen=True)
 class BoundarySection:
-    """Ranges of the hand's path in the demonstrations: of its radius of curvature and its length.
+    """Ranges of the radius of curvature and of the length of the hand's path, in the demonstrations.
 
     HeiSD's boundary chooses between retrieval and the drafter (docs/methods.md §4.4). It scales the radius and the
     length of the robot's own path to [0, 1] by these ranges.
 
     Attributes:
         episodes: Number of episodes that were measured.
-        windows: The ranges for each window of the boundary. The key is the window's number of positions as text, such
-            as `15`.
+        windows: The ranges for each window size. The key is the number of newest hand positions that the boundary looks
+            at, as text, such as `15`.
     """
 
     episodes: int
@@ -73,18 +73,19 @@ class BoundarySection:
 class SkipLevel:
     """The threshold s_min of a task: the similarity at which verification is skipped (docs/methods.md §4.3).
 
-    Similarities are cosines. To measure the threshold, the best neighbour of each entry was searched in the other
-    episodes of the datastore. A neighbour is good if its chunk is close to the entry's chunk (`SkipSection.epsilon`).
+    Similarities are cosines. To measure the threshold, each entry's neighbour was looked up: the most similar entry in
+    the other episodes of the datastore. The neighbour is good if its chunk is close to the entry's chunk
+    (`SkipSection.epsilon`).
 
     Attributes:
-        s_min: A chunk is executed without verification if its similarity is at least `s_min`.
-        low: Lowest allowed value of `s_min`, if the skip rule changes `s_min` after each episode.
-        high: Highest allowed value of `s_min`, in the same case.
-        share: Share of the entries whose best neighbour has a similarity of at least `s_min`.
-        entries: Number of entries that were looked up.
-        within: Share of good neighbours among the neighbours that reach `s_min`. None: no neighbour reaches `s_min`.
-        error: Mean absolute error of the chunks of the neighbours that reach `s_min`, in normalised action units. None:
-            no neighbour reaches `s_min`.
+        s_min: A stored chunk is executed without verification if the similarity of its observation is at least `s_min`.
+        low: Lowest value of `s_min` that a skip rule may set, if it changes `s_min` after each episode.
+        high: Highest value of `s_min` that such a skip rule may set.
+        share: Share of the entries whose neighbour has a similarity of at least `s_min`.
+        entries: Number of entries whose neighbours were looked up.
+        within: Share of good neighbours among the neighbours that reach `s_min`. None if no neighbour reaches `s_min`.
+        error: Mean absolute difference between an entry's chunk and its neighbour's, over the neighbours that reach
+            `s_min`, in normalised action units. None if no neighbour reaches `s_min`.
     """
 
     s_min: float
@@ -102,9 +103,9 @@ class SkipSection:
 
     Attributes:
         datastore: Hash of the datastore.
-        epsilon: Largest mean absolute error of a good chunk, in normalised action units. Its strict tokens, such as the
-            gripper's, must also be equal.
-        confidence: Minimum share of good chunks among the chunks that reach the threshold.
+        epsilon: A neighbour is good if its chunk differs from the entry's by at most `epsilon`, as mean absolute
+            difference in normalised action units. Strict tokens, such as the gripper's, must also be equal.
+        confidence: Minimum share of good neighbours among the neighbours that reach the threshold.
         tasks: Threshold of each task.
     """
 
@@ -121,7 +122,7 @@ class Calibration:
     Attributes:
         target: The target that was measured.
         demos: The demonstrations.
-        window: Number of control steps of history that a predictor sees.
+        window: Number of past actions that a predictor reads, one per control step.
         noise: Noise of each Kalman filter per DoF, by the filter's name (`kalman`, `damped`).
         variability: Typical kinematic variability K of each task, with its reference level K_S.
         boundary: Ranges of the hand's path, by which HeiSD's boundary scales radius of curvature and path length.
@@ -150,7 +151,7 @@ class Calibration:
 
         Args:
             task: Full name of the task.
-            measure: How K is computed.
+            measure: Way to compute K.
 
         Raises:
             CheckpointError: K_S was not measured for this task or this measure.
@@ -185,10 +186,10 @@ class Calibration:
         return windows[str(window)]
 
     def skip_levels(self, task: str, datastore: str) -> tuple[float, float, float]:
-        """Return (low, s_min, high). From the similarity s_min on, the task skips verification.
+        """Return the similarity s_min at which the task skips verification, and its bounds, as (low, s_min, high).
 
-        A skip rule may change s_min after each episode, between low and high. If the task never skips, all three are
-        NEVER, which is above every similarity.
+        A skip rule may change s_min after each episode, between low and high. If the task never skips verification, all
+        three numbers are NEVER, which is above every similarity.
 
         Args:
             task: Full name of the task.
@@ -233,12 +234,13 @@ class CalibrationArtifact(Artifact[Calibration]):
         return path
 
     def check_use(self, description: Calibration, use: Use) -> None:
-        """Refuse a method that reads a number that was not measured.
+        """Refuse a method whose parts need numbers that were not measured.
 
-        A threshold may read K_S of a task (docs/methods.md §3.2). A boundary may read the quantiles of F (§4.4).
+        A threshold may need K_S of a task (docs/methods.md §3.2). A boundary may need the quantiles of F, the weighted
+        sum of radius of curvature and path length (§4.4).
 
         Raises:
-            CheckpointError: The number was not measured.
+            CheckpointError: Such a number was not measured.
         """
         threshold, boundary = use.method["threshold"], use.method["boundary"]
         if isinstance(boundary, FusedBoundarySettings) and boundary.f_star is None:
@@ -257,5 +259,5 @@ class CalibrationArtifact(Artifact[Calibration]):
         return all(section for kind, section in sections.items() if kind in kinds)
 
     def made_for(self, description: Calibration) -> MadeFor:
-        """Return what identifies the target that the calibration was made for."""
+        """Return the hash, action space and chunk length of the target that the calibration was made for."""
         return description.target

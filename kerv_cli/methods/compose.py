@@ -25,7 +25,7 @@ class Method:
 
     Attributes:
         settings: Settings of the parts, by kind, for all kinds in METHOD_KINDS.
-        chunk: Number of control steps per chunk. 0: as many as the target was trained for.
+        chunk: Number of control steps per chunk. If 0, as many as the target was trained for.
         name: Name of the method, for messages.
     """
 
@@ -127,7 +127,7 @@ class Method:
         """Check that the method can decode several episodes together.
 
         Raises:
-            UsageError: The method cannot. The message names the part that decodes only one episode at a time.
+            UsageError: The method decodes only one episode at a time. The message names the method or its threshold.
         """
         draft, skip = self.prefill_draft, self.skip
         threshold = registry.ThresholdPart.find(self.settings["threshold"].kind)

@@ -18,10 +18,10 @@ class Context:
     Attributes:
         target: A `Target`. Some parts need a `ReadableTarget` (`engine/protocol.py`).
         artifact: Returns the loaded artifact of a kind, such as `drafter`.
-        task: Full name of the task. Empty: unknown.
+        task: Full name of the task. Empty if unknown.
         built: The method's parts that are built already, by kind such as `proposer`.
         method: Settings of all parts of the method, by kind.
-        chunk: Number of control steps per chunk. 0: as many as the target was trained for.
+        chunk: Number of control steps per chunk. If 0, as many as the target was trained for.
     """
 
     target: Any
@@ -33,5 +33,5 @@ class Context:
 
     @property
     def calibration(self) -> Any:
-        """The target's `Calibration`. It is typed as Any to avoid a circular import."""
+        """The policy's `Calibration`. The type is Any to avoid a circular import."""
         return self.artifact("calibration")

@@ -1,4 +1,4 @@
-"""Base of drafters with weights. Each kind is one class that trains, saves, loads and proposes (docs/extending.md)."""
+"""Base class of drafters with weights: a subclass trains, saves, loads and proposes (docs/extending.md)."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ Metrics = dict[str, float]
 
 @dataclass(frozen=True, kw_only=True)
 class DrafterDescription(checkpoint.Description):
-    """The JSON beside a drafter's weights. A kind of drafter may add fields.
+    """Contents of the JSON file beside a drafter's weights. A kind of drafter may add fields.
 
     Attributes:
         target: Hash of the target's weights.
         actions: The target's action space.
-        chunk: The target's number of control steps per chunk. 0: the drafter works with any number.
-        settings: Settings of the drafter's shapes and training.
+        chunk: The target's number of control steps per chunk. If 0, the drafter works with any number.
+        settings: Settings of the network's shapes and of the training.
         provenance: How the drafter was made.
     """
 
@@ -64,7 +64,7 @@ class Decodes(Rows):
 
 
 def evenly(steps: np.ndarray, share: float) -> np.ndarray:
-    """Return evenly spread steps: the given share of `steps` (n,). The first step is always included."""
+    """Choose a share (above 0, at most 1) of `steps` (n,), evenly spread. The first step is always included."""
     order = np.arange(len(steps))
     return steps[np.ceil((order + 1) * share - 1e-9) > np.ceil(order * share - 1e-9)]
 
@@ -177,7 +177,7 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         """
 
     def anew(self, path: Path) -> str:
-        """Return how to replace the drafter in `path`, which was trained for another target, for error messages.
+        """Return advice for an error message: how to replace the drafter in `path`, trained for another target.
 
         The user must remove the old drafter first, because a training can only be resumed for its own target.
         """

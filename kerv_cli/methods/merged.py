@@ -78,7 +78,7 @@ class MergedProposer(ChainProposer):
 
     @classmethod
     def build(cls, settings: MergedProposerSettings, context: Context) -> MergedProposer:
-        """Build the part that the setting `proposer=merged` chooses."""
+        """Build the part that the setting `prefill_draft=merged` or `proposer=merged` chooses."""
 
         def source(name: str) -> ChainProposer:
             part = ProposerPart.find(name)
@@ -95,7 +95,7 @@ class MergedProposer(ChainProposer):
             source.reset()
 
     def similarity(self, chunk: Chunk) -> float | None:
-        """Return the cosine of the most similar stored entry that one of the proposers found in its datastore.
+        """Return the cosine similarity of the most similar stored entry that one of the proposers found.
 
         Return None if no proposer searched a datastore for this chunk.
         """

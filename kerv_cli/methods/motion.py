@@ -53,7 +53,8 @@ class MotionRule(DistanceRule):
 
     Each of the two motions is decoded from the committed tokens, the accepted draft tokens, and one of the two tokens.
     Coefficients that are still missing count as zero. No action of the chunk may differ by more than `tolerance`. The
-    draft token may not decide more coefficients than the target's token, and may not end the chunk in its place.
+    draft token may not decide more coefficients than the target's token. It may end the chunk only if the target's
+    token does so, too.
     """
 
     tolerance: float
@@ -72,7 +73,7 @@ class MotionRule(DistanceRule):
 
     @functools.cached_property
     def basis(self) -> np.ndarray:
-        """(H · D, H · D) float64. Row i is the flattened motion whose coefficient i is 1, and all others are 0."""
+        """(H · D, H · D) float64. Row i is the flattened motion if coefficient i is 1 and every other one is 0."""
         import numpy as np
 
         unit = np.eye(self.code.steps * self.code.dofs)
@@ -85,7 +86,7 @@ class MotionRule(DistanceRule):
     def difference(self, before: Sequence[int], token: int, other: int) -> float:
         """Return the largest difference between the normalised actions of two motions.
 
-        One is decoded from the tokens `before` and `token`, the other from the tokens `before` and `other`.
+        The first motion is decoded from the tokens `before` and `token`, the second from `before` and `other`.
         """
         import numpy as np
 
@@ -97,7 +98,11 @@ class MotionRule(DistanceRule):
         return float(np.abs(gap @ self.basis[start:]).max(initial=0.0))
 
     def judge_after(self, tokens: Sequence[int], tree: TokenTree, target_tokens: Sequence[int], r: int) -> Accepted:
-        """Return the longest path of accepted draft tokens. Of equally long paths the first wins. `r` is not used."""
+        """Return the longest path of accepted draft tokens after the committed `tokens`. `r` is not used.
+
+        Of equally long paths the first wins. `target_tokens` holds the target's prediction after the last committed
+        token, then after each node of the tree.
+        """
         paths: dict[int, list[int]] = {ROOT: list(tokens)}  # tokens of the chunk up to each accepted node
         best = ROOT
         for node, (token, parent) in enumerate(zip(tree.tokens, tree.parents, strict=True)):
@@ -124,7 +129,7 @@ class CoarseBoundarySettings:
 class Coarse(Boundary):
     """Ends every chunk after at most `tokens` FAST tokens.
 
-    The tokens after them would give the coefficients of the highest frequencies. These coefficients are zero.
+    The tokens after that would give the coefficients of the highest frequencies. These coefficients count as zero.
     """
 
     @classmethod

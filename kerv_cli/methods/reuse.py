@@ -33,8 +33,8 @@ class JacobiProposer(ChainProposer):
     """Guesses the remaining tokens of a chunk. After each forward, the target's tokens become the next guess.
 
     With strict acceptance this ends with the tokens of autoregressive decoding. If a prefill draft was rejected, the
-    first guess begins with the target's tokens after the rejection. Its other tokens are the end token, or the middle
-    token (normalised action 0) if chunks have no end token.
+    first guess begins with the target's tokens after the rejection. All other tokens of the first guess are the end
+    token, or the middle token (normalised action 0) if chunks have no end token.
 
     Attributes:
         guess: The current guess of the remaining tokens.
@@ -79,9 +79,9 @@ class LookupProposerSettings:
 class LookupProposer(ChainProposer):
     """Searches the last chunk for the newest committed tokens, and drafts the tokens that followed there.
 
-    The newest `longest` tokens are searched for, then fewer of them. If they occur several times, the occurrence
-    nearest to the current index in the chunk wins. If not even the newest token occurs, or before the prefill, the
-    draft is the last chunk's tokens from the current index on.
+    The newest `longest` tokens are searched for first. If they do not occur, fewer tokens are searched for. If they
+    occur several times, the occurrence nearest to the current index in the chunk wins. If not even the newest token
+    occurs, or if no token is committed yet, the draft is the last chunk's tokens from the current index on.
     """
 
     name = "lookup"

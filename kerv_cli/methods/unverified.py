@@ -57,7 +57,7 @@ class ParallelPass(Skip):
 
 
 def native_decoder(target: Any) -> Decoder:
-    """Return a decoder without drafts. A parallel target decodes all tokens in one forward, others token by token."""
+    """Return a decoder without drafts. A parallel target decodes all tokens at once, any other target one by one."""
     from kerv_cli.engine.decoder import Decoder, Parts
 
     return Decoder(target, Parts(skip=ParallelPass(target)) if getattr(target, "parallel", False) else None)
@@ -94,7 +94,7 @@ class StreakSkip(Skip):
     """
 
     def __init__(self, settings: StreakSkipSettings, context: Context) -> None:
-        """Take the drafts of the method's prefill draft, or of its first source."""
+        """Use the method's prefill draft. If it merges the drafts of several proposers, use only the first proposer."""
         from kerv_cli.methods.merged import MergedProposer
 
         draft = context.built["prefill_draft"]
@@ -104,11 +104,14 @@ class StreakSkip(Skip):
         self.chain: tuple[int, ...] = ()
 
     def begin(self, task: str, seed: int) -> None:
-        """Begin an episode. Its first decodes may go unverified, as many as the setting `opening` says."""
+        """Begin an episode. The setting `opening` says how many of its first decodes may go unverified."""
         self.allowed = self.left = self.settings.opening
 
     def take(self, chunk: Chunk) -> SkipDecision:
-        """Take the draft, unverified, if one more such decode is allowed and the draft has all N tokens."""
+        """Return the draft, to execute it unverified, if that is allowed now and the draft has all N tokens.
+
+        Otherwise return no tokens: the target decodes the chunk.
+        """
         chains = self.source.chains(chunk, chunk.size)
         self.chain = tuple(chains[0]) if chains else ()
         if not self.left or len(self.chain) < chunk.size:
@@ -142,7 +145,7 @@ class AlwaysSkip(Skip):
         return cls(context.built["prefill_draft"])
 
     def take(self, chunk: Chunk) -> SkipDecision:
-        """Take the draft, without verification, if it has all N tokens."""
+        """Return the draft, to execute it unverified, if it has all N tokens. Otherwise return no tokens."""
         chains = self.source.chains(chunk, chunk.size)
         if not chains or len(chains[0]) < chunk.size:
             return SkipDecision()

@@ -56,7 +56,7 @@ class ScopedSettings:
 
 @ArtifactPart("certificate", sees=True, by_task=True, names_more=True, study="certify")
 def artifact() -> type:
-    """Import and return the class that makes and loads certificates."""
+    """Import and return the class that finds, checks and loads certificates."""
     from kerv_cli.methods.certified.certificate import CertificateArtifact
 
     return CertificateArtifact

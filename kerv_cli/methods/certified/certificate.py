@@ -31,8 +31,8 @@ class Candidate:
         successes: Number of episodes that the candidate solved.
         lost: Number of pairs that only AR solved.
         won: Number of pairs that only the candidate solved.
-        p: p-value of the hypothesis that the candidate loses the margin or more. None: not tested, because an earlier
-            candidate failed.
+        p: p-value of the hypothesis that the candidate loses the margin or more. None if it was not tested, because an
+            earlier candidate failed or AR solved too few episodes.
         draft: Settings of the proposer whose drafts the rule executes. Old certificates do not store these settings.
             All their drafts came from the scout, a drafter that reads the image itself.
     """
@@ -67,7 +67,7 @@ class Attempt:
     """Summary of one test of a policy. Each certificate lists the policy's earlier tests.
 
     Attributes:
-        made: Time of the test, ISO 8601. Empty: not recorded.
+        made: Time of the test, ISO 8601. Empty if not recorded.
         test: Hash of the test's set-up: `Certificate.test`.
         order: Labels of the candidates in the order of the tests.
         seeds: Seeds of the episodes, as text such as `1000-1049;1100`.
@@ -114,7 +114,7 @@ class Certificate:
         delta: Level of this test: an upper bound of the probability that the test certifies falsely.
         seeds: Seeds of the test episodes, as text such as `1000-1049;1100`.
         candidates: All candidates in the order of the tests, from cautious to bold.
-        chosen: Index of the last, and so the boldest, certified candidate. None: no candidate was certified.
+        chosen: Index of the last, and so the boldest, certified candidate. None if no candidate was certified.
         provenance: How the certificate was made.
         made: Time of the test, ISO 8601. Empty in certificates of older versions.
         earlier: All earlier tests of the same policy, oldest first.
@@ -140,7 +140,7 @@ class Certificate:
 
     @property
     def is_tested(self) -> bool:
-        """Whether the tests had enough episodes that AR solved to judge any of the candidates."""
+        """Whether any candidate was tested. No candidate is tested if AR solved too few episodes."""
         return any(one.p is not None for one in self.candidates)
 
     @property
@@ -229,7 +229,7 @@ class CertificateArtifact(Artifact[Certificate]):
     schema = Certificate
 
     def made_for(self, description: Certificate) -> MadeFor:
-        """Return what identifies the certified target. Its chunk length is checked later, when the decoder is built."""
+        """Return hash and action space of the certified target. The chunk length is checked when a decoder is built."""
         return MadeFor(description.target, description.actions)
 
     def sources(self, description: Certificate) -> Mapping[str, str]:

@@ -85,7 +85,7 @@ class DrafterProposer(Proposer):
 
     Attributes:
         depth: Maximum number of tokens on a path.
-        top_k: Number of nodes per depth that get children, and number of children of each. 1 drafts a chain.
+        top_k: Number of nodes per depth that get children, and number of children of each. If 1, the draft is a chain.
         nodes: Maximum number of nodes. The most probable nodes are kept.
         cache: Keys and values of the drafter, for all committed positions except the last.
         hidden: (E,) predicted hidden state. The target's head computes the first draft token from it.
@@ -222,10 +222,10 @@ class EagleExamples(Decodes):
 
 @dataclass(frozen=True, kw_only=True)
 class EagleDescription(DrafterDescription):
-    """The JSON beside an EAGLE-style drafter's weights.
+    """Contents of the JSON file beside an EAGLE-style drafter's weights.
 
     Attributes:
-        public: Shape of a drafter in the published layout. None: the drafter has our own layout.
+        public: Shape of a drafter in the published layout. None if the drafter has our own layout.
     """
 
     public: PublicShape | None = None
@@ -257,7 +257,7 @@ class EagleDrafter(TrainableDrafter):
 
     @classmethod
     def proposer(cls, settings: Any, context: Context) -> DrafterProposer:
-        """Build the part that proposer=drafter chooses, or that proposer=hybrid contains.
+        """Build the proposer for `proposer=drafter`, or the one that the proposer `hybrid` contains.
 
         The settings of both proposers have the fields shape, depth, top_k and nodes.
 
@@ -302,8 +302,8 @@ class EagleDrafter(TrainableDrafter):
         """Return the loss and the metrics to log, for B examples with prompts of one length.
 
         The first pass reads the target's hidden states. Each later pass reads the drafter's own predictions of the pass
-        before, as in drafting. The loss is the weighted sum of two: the smooth L1 loss of the states, and the
-        cross-entropy of the drafter's token distribution with the target's.
+        before, as in drafting. The loss of a pass is the weighted sum of two losses: the smooth L1 loss of the states,
+        and the cross-entropy of the drafter's token distribution with the target's. The result is the mean over passes.
 
         Args:
             network: The drafter.
@@ -343,7 +343,7 @@ class EagleDrafter(TrainableDrafter):
         """Decode held-out observations. Return the acceptance lengths with strict and relaxed (r = 9) acceptance.
 
         The acceptance length is the number of tokens committed per verification. The score is the sum of both lengths.
-        The network drafts in the target's number format, as it will after it has been saved and loaded.
+        The network drafts in the target's number format, as it does in use.
         """
         chosen = torch.linspace(0, len(held_out) - 1, min(VALIDATED, len(held_out))).long().tolist()
         prompts = [held_out.prompt[i, : held_out.lengths[i]][None].to(target.device, target.dtype) for i in chosen]
@@ -359,7 +359,7 @@ def acceptance_length(target: Target, network: EagleNetwork, prompts: list[Tenso
         target: The target.
         network: The drafter. It drafts chains of up to 5 tokens.
         prompts: Encoded prompts to decode, each (1, P, E).
-        r: A draft token within r bins of the target's token is accepted.
+        r: Acceptance radius, in bins. Tokens of strict DoFs, such as the gripper, must equal the target's.
     """
     proposer = DrafterProposer(network, target, depth=5, top_k=1, nodes=5)
     decoder = Decoder(target, Parts(RelaxedRule(target.actions), Fixed(r), proposer=proposer))

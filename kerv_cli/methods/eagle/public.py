@@ -35,10 +35,11 @@ class Convention:
     """Two ways in which a published drafter may differ from our own.
 
     Attributes:
-        positions: Rotary positions of drafted tokens. `sequence`: they count all tokens before. `text`: they do not
-            count the vision tokens, because the published code counts token ids and vision tokens have none.
-        mask: `causal`: every token sees all tokens before it. `prompt`: every token sees only the prompt without its
-            last token. Spec-VLA's drafter was trained with this mask.
+        positions: How the rotary positions of drafted tokens are counted. With `sequence`, all earlier tokens count.
+            With `text`, vision tokens do not count, because the published code counts token ids, and vision tokens
+            have no ids.
+        mask: With `causal`, every token sees all tokens before it. With `prompt`, every token sees only the prompt
+            without the prompt's last token. Spec-VLA's drafter was trained with the mask `prompt`.
     """
 
     positions: str = "sequence"
@@ -53,7 +54,7 @@ class PublicShape:
         language: Sizes of the drafter's Llama layer.
         bias: Whether `fc` has a bias.
         convention: How the drafter differs from our own.
-        skipped: Number of vision tokens in the target's prompt. They get no position number with `positions=text`.
+        skipped: Number of vision tokens in the target's prompt. With `positions=text`, positions do not count them.
     """
 
     language: Language
@@ -63,7 +64,7 @@ class PublicShape:
 
 
 class DraftCache(Cache):
-    """Keys and values of a drafter. The attribute `prompt` is the number of prompt tokens."""
+    """Cached keys and values of a drafter. The attribute `prompt` is the number of prompt tokens."""
 
     prompt = 0
 
@@ -72,8 +73,7 @@ class DraftNetwork(nn.Module):
     """Base of the networks of EAGLE-style drafters.
 
     Attributes:
-        skipped: Number of prompt tokens that get no position number. Rotary positions of drafted tokens do not count
-            them.
+        skipped: Number of prompt tokens that do not count in the rotary positions of drafted tokens.
     """
 
     skipped = 0
@@ -94,8 +94,9 @@ class DraftNetwork(nn.Module):
             hidden: (B, T, E) hidden state at each position.
             positions: (T,) rotary positions.
             cache: Keys and values of earlier positions. If it is empty, `hidden` must have the states of the whole
-                prompt. None: there are no earlier positions.
-            seen: (T, M) bool, which of the last M keys each query sees. None: all keys up to its own position.
+                prompt. None if there are no earlier positions.
+            seen: (T, M) bool, which of the last M keys each query sees. If None, a query sees all keys up to its own
+                position.
         """
         return self.run((following, hidden), positions, cache, seen)
 

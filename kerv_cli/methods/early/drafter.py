@@ -196,9 +196,9 @@ class EarlyProposer(ChainProposer):
         self._drafted: tuple[Chunk, list[int], float] | None = None  # the last chunk, its draft, and the estimate
 
     def compile(self) -> Program | None:
-        """Return a compiled program that computes `row` from a radius (1, 1) and a prompt.
+        """Return a compiled program that computes the result of `row` from a radius (1, 1) and a prompt.
 
-        Return None if the drafter is not compiled, or if the target cannot be compiled together with it.
+        Return None if the drafter is not compiled, or if drafter and target cannot be compiled together.
         """
         early: Any = self.early
         target: Any = self.target
@@ -300,7 +300,7 @@ class EarlyDrafter(TrainableDrafter):
         """Return metrics that compare drafts of held-out observations with the target's tokens.
 
         All perturbed episodes (executed with noise) together weigh as much as all other episodes together. The score is
-        the mean number of accepted tokens with strict acceptance, plus the same with the acceptance radius 9.
+        the mean number of accepted tokens with strict acceptance, plus the mean number with the acceptance radius 9.
         """
         chosen = torch.arange(len(held_out)).split(256)
         outputs = [self.outputs(network, target, held_out.where(indices)) for indices in chosen]
@@ -333,8 +333,9 @@ def measure(logits: Tensor, examples: Decodes, strict: Tensor, end: int | None =
         end: The token that ends a chunk. Tokens after it are not counted. None: chunks have no such token.
 
     Returns:
-        For each radius the mean number of accepted tokens and the share of drafts that are accepted whole. Also the
-        token accuracy: the share of the drafter's most probable tokens that equal the target's.
+        For each radius the mean number of accepted tokens, and the share of drafts of which all tokens are accepted.
+        Also the token accuracy: the share of the drafter's most probable tokens that equal the target's. In each mean,
+        perturbed episodes together weigh as much as all other episodes together.
     """
     kinds = [mask for mask in (examples.perturbed, ~examples.perturbed) if mask.any()]
 
@@ -457,9 +458,9 @@ class ScoutProposer(EarlyProposer):
         super().__init__(scout.drafter, target)
 
     def compile(self) -> Program | None:
-        """Return a compiled program that computes `row` from a radius (1, 1) and the results of `ScoutNetwork.views`.
+        """Return a compiled program that computes the result of `row`. Return None if the scout is not compiled.
 
-        Return None if the scout is not compiled.
+        The program's inputs are a radius (1, 1) and the tensors that `ScoutNetwork.views` returns.
         """
         scout: Any = self.scout
 
@@ -483,10 +484,9 @@ class ScoutProposer(EarlyProposer):
 
 @dataclass(frozen=True)
 class ScoutExamples(Observations, Decodes):
-    """The n training examples of a scout: observations, and what the target decoded and estimated from them.
+    """The n training examples of a scout: observations, and the target's tokens and position estimates for them.
 
-    The target decoded tokens, and estimated the positions of object and goal. The simulator's true positions are not
-    used.
+    The positions are those of object and goal. The simulator's true positions are not used.
     """
 
     places: Tensor  # (n, K, 3) float32, positions estimated by the target, metres

@@ -44,7 +44,7 @@ ROUNDING = 1e-5  # largest rounding error of a float32 dot product of two unit v
 
 @registry.ArtifactPart("datastore", by_task=True, needs_task=True, described_by=MANIFEST)
 def artifact() -> type:
-    """Import and return the class that makes and loads datastores."""
+    """Import and return the class that finds, checks and loads datastores."""
     from kerv_cli.methods.heisd.datastore import DatastoreArtifact
 
     return DatastoreArtifact
@@ -77,7 +77,7 @@ class ExactIndex(Index):
     """datastore=exact, the default: compare the key with all entries of the task, in this process."""
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return the k most similar rows, and all other rows that could be among them but for rounding errors.
+        """Return the k most similar rows. Also return every other row that rounding errors may have kept out of them.
 
         `Index.candidates` explains the arguments.
         """
@@ -132,7 +132,7 @@ class RetrievalProposer(ChainProposer):
         return self._nearest[1]
 
     def similarity(self, chunk: Chunk) -> float | None:
-        """Return the cosine of the most similar stored entry. None if the datastore was not searched for this chunk."""
+        """Return the cosine similarity of the most similar stored entry. None if no search was made for this chunk."""
         searched = self._nearest is not None and self._nearest[0] is chunk
         return float(self.neighbours(chunk).similarity[0]) if searched else None
 
@@ -196,7 +196,7 @@ class HybridProposer(Proposer):
         self.chosen.begin(chunk)
 
     def similarity(self, chunk: Chunk) -> float | None:
-        """Return the cosine of the most similar stored entry. None if the datastore was not searched for this chunk."""
+        """Return the cosine similarity of the most similar stored entry. None if no search was made for this chunk."""
         return self.proposers["retrieval"].similarity(chunk)
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
@@ -274,7 +274,7 @@ class HybridAcceptanceSettings(SequenceAcceptanceSettings):
 @registry.AcceptancePart("hybrid", HybridAcceptanceSettings)
 @dataclass(frozen=True, kw_only=True)
 class HybridRule(RelaxedRule):
-    """Accepts retrieved drafts by kinematic group, and all other drafts token by token within a radius.
+    """Judges retrieved drafts by kinematic group, and all other drafts token by token, by the radius r.
 
     Attributes:
         retrieved: The rule for retrieved drafts.
@@ -327,7 +327,7 @@ class Random(Boundary):
         self.random = np.random.default_rng([self.settings.seed, zlib.crc32(task.encode()), seed])
 
     def choose(self, path: np.ndarray) -> Choice:
-        """Choose retrieval with probability p, else the drafter. The path is not used."""
+        """Choose retrieval with probability p, else the drafter. The hand's path is not used."""
         return Choice("retrieval" if self.random.random() < self.settings.p else "drafter")
 
 
@@ -335,7 +335,7 @@ class Always(Boundary):
     """Makes the same choice for every chunk: boundary=always_retrieval or boundary=always_drafter."""
 
     def choose(self, path: np.ndarray) -> Choice:
-        """Return the choice that the boundary's name tells. The path is not used."""
+        """Choose retrieval or the drafter, whichever the boundary's name says. The hand's path is not used."""
         return Choice(self.settings.kind.removeprefix("always_"))
 
 
@@ -415,8 +415,8 @@ class VerifySkip(Skip):
     """Executes the most similar stored chunk without verification if its similarity is at least s_min.
 
     At most `max_skips` chunks in a row are executed without verification. If the method has a boundary, the boundary
-    must choose retrieval. Once a stored episode has been executed to its end, none of its chunks is executed without
-    verification again in the same episode of the robot.
+    must choose retrieval. Once the last chunk of a stored episode has been executed, no chunk of that stored episode
+    is executed without verification in the rest of the robot's own episode.
 
     With `up` or `down` above 0, s_min changes after each episode. A failure raises it by `up` times the calibrated
     range (high − low), a success lowers it by `down` times the range. Then results depend on the order of the episodes.
@@ -465,7 +465,7 @@ class VerifySkip(Skip):
         self.s_min = min(self.high, max(self.low, s_min))
 
     def similarity(self, chunk: Chunk) -> float | None:
-        """Return the cosine of the most similar stored entry. None if the datastore was not searched for this chunk."""
+        """Return the cosine similarity of the most similar stored entry. None if no search was made for this chunk."""
         return self.retrieval.similarity(chunk)
 
     def take(self, chunk: Chunk) -> SkipDecision:

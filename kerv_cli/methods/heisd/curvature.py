@@ -57,9 +57,9 @@ class BoundaryRanges:
         radius_high: 95th percentile of R.
         length_low: Minimum of D.
         length_high: 95th percentile of D.
-        points: Scaled R and scaled D, in [0, 1], of a hundred windows of the paths. These windows are evenly spaced in
-            the list of all windows sorted by R + D. They give the quantiles of F, the weighted sum of the scaled R and
-            D. Empty in calibrations before version 1.1.
+        points: Scaled R and scaled D, in [0, 1], of a hundred windows (sections of the paths). These windows are evenly
+            spaced in the list of all windows sorted by scaled R + scaled D. They give the quantiles of F, the weighted
+            sum of scaled R and scaled D. Empty in calibrations before version 1.1.
 
     Raises:
         CheckpointError: A range is empty or not finite.
@@ -85,8 +85,8 @@ class BoundaryRanges:
         Args:
             paths: Measured hand positions of each episode, (T, 3) metres.
             window: Number of positions in a window.
-            known: An older calibration's ranges. They are kept, and only the attribute `points` is measured. None:
-                measure everything.
+            known: An older calibration's ranges. They are kept, and only the attribute `points` is measured. If None,
+                everything is measured.
 
         Raises:
             CheckpointError: No path is curved, or the hand never moves.

@@ -159,11 +159,12 @@ def best(vectors: np.ndarray, rows: np.ndarray, key: np.ndarray, k: int) -> tupl
     Args:
         vectors: (all rows, d) stored keys.
         rows: Candidate rows, in ascending order.
-        key: (d,).
+        key: (d,) search key.
         k: Number of rows wanted.
 
     Returns:
-        The rows and their similarities float32, most similar first. Equally similar rows are in ascending order.
+        The rows (k,) and their similarities (k,) float32, most similar first. Fewer if there are fewer candidates.
+        Equally similar rows are in ascending order.
     """
     scores = np.einsum("ij,j->i", vectors[rows].astype(np.float64), key.astype(np.float64)).astype(np.float32)
     order = np.argsort(-scores, kind="stable")[:k]
@@ -214,7 +215,7 @@ class Datastore:
         Args:
             folder: Folder of the datastore.
             description: Description of the target.
-            search: Settings of the search. None: exact search.
+            search: Settings of the search. If None, the search is exact.
 
         Raises:
             CheckpointError: The datastore is missing or damaged. Or it was built for another target, other action
@@ -261,7 +262,7 @@ class Datastore:
             key: (d,) search key.
             task: Full name of the task.
             k: Number of entries.
-            without: Seed of an episode to leave out, for leave-one-episode-out measurements. None: use all episodes.
+            without: Seed of an episode to leave out, for leave-one-episode-out measurements. If None, use all episodes.
 
         Raises:
             UnknownName: The datastore has no entries of this task.
@@ -340,8 +341,9 @@ def neighbour_tree(
         start: Number of committed tokens. The tree begins after them.
         space: The action space.
         nodes: Maximum number of nodes of the tree.
-        depth: Maximum number of tokens on a path. None: up to the chunk's end.
-        cross: Probability of a change after a group. 0: paths never change, so only whole chunks are merged.
+        depth: Maximum number of tokens on a path. If None, paths end with the chunk.
+        cross: Probability that a path changes to another neighbour after a group. If 0, paths never change, so only
+            whole chunks are merged.
     """
     stop = chunks.shape[1] if depth is None else min(chunks.shape[1], start + depth)
     # sets of neighbours are numbers, whose bits stand for neighbours
@@ -367,7 +369,7 @@ def neighbour_tree(
             parent: Last node of the path.
             level: Number of groups on the path.
             last: Bit set of the neighbours whose chunks have the last group of the path.
-            whole: Bit set of the neighbours whose chunks have all groups of the path. If none has, `last`.
+            whole: Bit set of the neighbours whose chunks have all groups of the path. Equal to `last` if there is none.
             cost: −log probability of the path.
         """
         strict, givers = levels[level] if level < len(levels) else (False, [])

@@ -73,7 +73,7 @@ PredictorPart("walk", colour=0x999933)(predictor)
 
 ACCEPTED = "accepted"
 DRAFT = "draft"
-"""Value of `rectifier.predictor` that fills with the rejected draft instead of a kinematic prediction."""
+"""With this value of `rectifier.predictor`, the rejected draft's tokens fill the gap, not a kinematic prediction."""
 
 
 def find_predictor(name: str) -> PredictorPart:
@@ -126,7 +126,7 @@ class CompensateSettings:
 
 @RectifierPart("compensate", CompensateSettings, needs=CompensateSettings.needs)
 class Compensation(Rectifier):
-    """KERV: after a rejected draft token, keeps the tokens before and predicts the rest of the control step.
+    """KERV: after a rejected draft token, keeps the tokens before it and predicts the rest of the control step.
 
     The settings change what is kept and predicted:
 
@@ -160,7 +160,10 @@ class Compensation(Rectifier):
         self.resting = max(0, self.resting - 1)
 
     def rectify(self, chunk: Chunk) -> Rectified | None:
-        """Predict the missing values of the rejected control step, unless the rectifier rests."""
+        """Predict the missing values of the rejected control step, and of further steps if `steps` is above 1.
+
+        Return None if the rectifier rests, or if nothing can be predicted.
+        """
         from kerv_cli.methods.kerv.prediction import assemble
 
         if self.resting:
@@ -224,7 +227,7 @@ class KinematicThresholdSettings(RadiusRange):
 
     @property
     def measure(self) -> Measure:
-        """How K is computed."""
+        """Way to compute the variability K, by the settings `over` and `total`."""
         from kerv_cli.engine.record import Measure
 
         return Measure(self.over == ACCEPTED, self.total)
@@ -301,7 +304,7 @@ class Variable(Threshold):
         """Set r for the next decode.
 
         Args:
-            variability: K of the last decode. None: no draft was compared, and r stays.
+            variability: K of the last decode. If None, no draft was compared, and r stays.
         """
         if variability is None:
             return

@@ -33,7 +33,7 @@ class Noise:
     """Parameters of a Kalman filter, one number per DoF.
 
     Only the ratio q / r matters, because the filter's initial covariance is r times the identity. The numbers of strict
-    DoFs (such as the gripper) are used only if `rectifier.hold_strict` is false. q = 0: the DoF was not fitted.
+    DoFs (such as the gripper) are used only if `rectifier.hold_strict` is false. If q is 0, the DoF was not fitted.
 
     Attributes:
         q: Process noise: variance of the random acceleration per control step.
@@ -51,8 +51,8 @@ class Noise:
 def filter_state(ratio: float, window: int, damping: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights by which a Kalman filter's state depends on the last actions.
 
-    The state is [action, velocity]. The filter begins at the first action with the state [a₀, 0] and the covariance r ·
-    I. For each further action it predicts and updates once.
+    The state is [action, velocity]. The filter begins at the first action a₀ with the state [a₀, 0] and the covariance
+    r · I. For each further action the filter predicts and updates once.
 
     Args:
         ratio: q / r, process noise by measurement noise.
@@ -60,8 +60,8 @@ def filter_state(ratio: float, window: int, damping: float) -> tuple[np.ndarray,
         damping: Factor of the velocity per control step.
 
     Returns:
-        Weights (2, window), whose product with the actions (oldest first) is the state after the last action; and the
-        matrix (2, 2) that advances a state by one control step.
+        Two matrices. The weights (2, window) times the actions (oldest first) give the state after the last action. The
+        transition matrix (2, 2) advances a state by one control step.
     """
     from filterpy.kalman import KalmanFilter
 
@@ -119,8 +119,8 @@ class Predictor:
         """Compute the weights for all numbers of past actions from `minimum` to `window`.
 
         Args:
-            held: (D,) bool. True: the DoF keeps its last value.
-            noise: Fitted noise of a Kalman filter. None: the predictor needs no fitted noise.
+            held: (D,) bool, whether the DoF keeps its last value.
+            noise: Fitted noise of a Kalman filter. None if the predictor needs no fitted noise.
             minimum: Smallest number of past actions from which actions are predicted.
             window: Maximum number of past actions that are used.
             horizon: Maximum number of control steps ahead.
@@ -269,7 +269,7 @@ PREDICTORS = {kind.name: kind for kind in (Hold, Linear, Kalman, Damped, Walk)}
 class PredictionProposer(ChainProposer):
     """Drafts the chunk by predicting it from the last actions (docs/methods.md §3.1, §6).
 
-    Committed control steps of the chunk count as executed. While the history is too short, nothing is drafted.
+    The chunk's committed control steps count as executed. While there are too few past actions, nothing is drafted.
     """
 
     def __init__(self, predictor: Predictor) -> None:
@@ -292,9 +292,9 @@ def assemble(
 ) -> np.ndarray | None:
     """Assemble the actions of a compensated chunk: known tokens, then drafted tokens, then predictions.
 
-    `settings.steps` control steps are filled. The first of them is the step in which the known tokens end. This step is
-    left out, and one step fewer is filled, if it has fewer than `min_verified` known DoFs. The same happens if it has
-    no known DoF and `drop` is set. The first step of the chunk is never left out.
+    `settings.steps` control steps are filled, beginning with the first step that is not completely known. That first
+    step is left out, and one step fewer is filled, if fewer than `min_verified` of its DoFs are known. It is also left
+    out if none of its DoFs is known and `drop` is set. The first step of the chunk is never left out.
 
     Args:
         tokens: Known tokens of the chunk: accepted draft tokens and tokens of the target.
@@ -304,7 +304,8 @@ def assemble(
         drafted: Tokens of the rejected draft that follow `tokens`. Empty: use predictions only.
 
     Returns:
-        (steps, D) normalised actions. None if the history is too short for a prediction.
+        (S, D) normalised actions of the chunk's first S control steps, known and filled ones. None if there are too few
+        past actions for a prediction.
     """
     dofs, horizon = chunk.dofs, chunk.steps
     whole, part = divmod(len(tokens), dofs)
