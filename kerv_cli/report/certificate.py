@@ -1,14 +1,14 @@
 """Issue a certificate of success from a study's paired episodes.
 
-The certificate states how much success a setting loses at most against AR (docs/methods.md §4.6, ours). AR is the
-study's baseline. The other settings are the candidates. The seeds must be new: no other study ran the policy on them.
-A policy is tested once. Only `again=true` allows a further test, with a smaller error probability.
+The certificate bounds the success that a setting loses against autoregressive decoding (AR; docs/methods.md §4.6,
+ours). AR is the study's baseline. The other settings are the candidates. The seeds must be new: no other study ran the
+policy on them. A policy is tested once. Only `again=true` allows a further test, with a smaller error probability.
 
-The test bets against a mean: the predictable plug-in bets of Waudby-Smith and Ramdas (2024).
-The hypothesis: each value in [0, 1] has an expectation of at least `bound`, given the values before it. A bettor bets
-against the hypothesis. Each bet is made before its value is known. The bettor's wealth starts at 1. If the hypothesis
-is true, the bets do not win on average, and the probability that the wealth ever reaches 1/δ is at most δ (Ville's
-inequality). So a wealth of 1/δ rejects the hypothesis at level δ, and the wealth may be checked after each value.
+The test uses the predictable plug-in bets of Waudby-Smith and Ramdas (2024). The values are in [0, 1]. The hypothesis
+is that each value has an expectation of at least `bound`, given the values before it. A bettor bets against the
+hypothesis. Each bet is made before the next value is known. The bettor's wealth starts at 1. If the hypothesis is true,
+the bets do not win on average, and the probability that the wealth ever reaches 1/δ is at most δ (Ville's inequality).
+So a wealth of 1/δ rejects the hypothesis at level δ, and the wealth may be checked after each value.
 
 Values of different groups, such as tasks, must come in random order. Sorted values would reject the hypothesis only
 because of their order.
@@ -62,18 +62,18 @@ _CONDITIONS = ("task", "seed", "episodes", "world", "rollout.clock", "runtime.dt
 """Settings that must be the same for all candidates and the baseline."""
 _SHARED = tuple(kind for kind in METHOD_KINDS if kind not in _VARIED)
 _OF_CANDIDATES = ("chunk", "policy", *_SHARED)
-"""Settings that must be the same for all candidates. The baseline may differ."""
+"""Settings that must be the same for all candidates, but may be different for the baseline."""
 
 
 def folder_of(resolved: ResolvedStudy) -> Path:
-    """Check that a study can give a certificate. Return the folder to write the certificate into.
+    """Check that a certificate can be issued from a study. Return the folder to write the certificate into.
 
     Candidates may differ only in the settings `prefill_draft` and `skip`. The baseline must be AR. All settings must
     have the same tasks, seeds, policy, number format and world, without stress. The world must wait during decodes.
 
     Raises:
-        UsageError: The study has only a baseline, or a condition is not met. Or its seeds are outside the range
-            reserved for selection, or the folder belongs to a policy that kerv ships.
+        UsageError: The study has only a baseline, or one of these conditions is not met. Or the study's seeds are
+            outside the range reserved for selection, or the folder belongs to a policy that kerv ships.
     """
     candidates = _candidates(resolved)
     if not candidates:
@@ -113,7 +113,8 @@ def planned_certificate(
         settings: Settings of the test.
 
     Raises:
-        UsageError: The policy was tested before and `settings.again` is not set, or its seeds were used before.
+        UsageError: The policy was tested before and `settings.again` is not set. Or another study or an earlier test
+            ran the policy on one of these seeds.
         CheckpointError: An artifact of a candidate is missing or damaged, or an existing certificate is damaged.
     """
     tested = _candidates(resolved)
@@ -210,7 +211,7 @@ def attempts_on(target: str, folders: Iterable[Path]) -> list[Attempt]:
 
 
 def _other_study(target: str, store: Study, episodes: Sequence[Episode]) -> str:
-    """Return the name of another study in which the policy ran some of these episodes. Empty if there is none."""
+    """Return the name of another study in which the policy ran one of these tasks with the same seed. Empty if none."""
     wanted, seeds = set(map(attrgetter("task", "seed"), episodes)), sorted(map(attrgetter("seed"), episodes))
     query = (
         sa.select(STUDIES.c.name, SETTINGS.c.identity, WANTED.c.task, WANTED.c.seed)
@@ -233,7 +234,7 @@ def certify(certificate: Certificate, store: Study, wanted: Sequence[Episode], b
 
     Args:
         certificate: The planned certificate.
-        store: The stored episodes of its study.
+        store: The study with the stored episodes.
         wanted: Episodes to use.
         baseline: Label of AR.
     """
@@ -268,7 +269,7 @@ def write(folder: Path, certificate: Certificate) -> Path:
 
 
 def candidate_rows(certificate: Certificate) -> list[dict[str, str]]:
-    """Return the table of candidates to print: one dictionary of column to text per candidate."""
+    """Return the table of candidates to print: for each candidate a dictionary from column name to text."""
     rows = []
     for one in certificate.candidates:
         test = {"p": "not tested", "certified": ""}
@@ -280,7 +281,7 @@ def candidate_rows(certificate: Certificate) -> list[dict[str, str]]:
 
 
 def _candidates(resolved: ResolvedStudy) -> dict[str, RolloutSettings]:
-    """Return the settings of a study other than its baseline by label, in the study's order."""
+    """Return all settings of a study except the baseline, by label, in the study's order."""
     settings = dict(resolved.settings)
     del settings[resolved.study.baseline]
     return settings
@@ -293,7 +294,7 @@ def bets(values: np.ndarray, bound: float, delta: float) -> np.ndarray:
 
     Args:
         values: (n,) in [0, 1], in the order in which they came.
-        bound: The hypothesis is a mean of at least `bound`, in (0, 1).
+        bound: The hypothesis is that the mean is at least `bound`, in (0, 1).
         delta: Error probability δ for which the bets are optimised.
 
     Returns:
@@ -312,22 +313,22 @@ def wealth(values: np.ndarray, bound: float, delta: float) -> np.ndarray:
 
     Args:
         values: (n,) in [0, 1], in the order in which they came.
-        bound: The hypothesis is a mean of at least `bound`, in (0, 1).
-        delta: Error probability δ for which the bets are optimised. A test at another level δ′ may use the same wealth:
-            it rejects if the wealth reaches 1/δ′.
+        bound: The hypothesis is that the mean is at least `bound`, in (0, 1).
+        delta: Error probability δ for which the bets are optimised. A test at another level δ′ may use the same wealth.
+            That test rejects the hypothesis if the wealth reaches 1/δ′.
     """
     return np.exp(np.cumsum(np.log1p(bets(values, bound, delta) * (bound - values))))
 
 
 def p_value(values: np.ndarray, bound: float, delta: float) -> float:
-    """Return the p-value of the hypothesis that the mean is at least `bound`; 1 without values.
+    """Return the p-value of the hypothesis that the mean is at least `bound`. It is 1 if there are no values.
 
     A bettor with an initial wealth of 1 bets against the hypothesis. The p-value is 1 divided by the largest wealth so
-    far. So it stays valid if it is checked after each value.
+    far. So the p-value stays valid if it is checked after each value.
 
     Args:
         values: (n,) in [0, 1], in the order in which they came.
-        bound: The hypothesis is a mean of at least `bound`, in (0, 1).
+        bound: The hypothesis is that the mean is at least `bound`, in (0, 1).
         delta: Error probability δ for which the bets are optimised.
     """
     return float(1 / max(1.0, wealth(values, bound, delta).max(initial=1.0)))

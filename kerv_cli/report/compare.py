@@ -30,7 +30,7 @@ _PROVENANCE = ("host", "device_name", "git_commit", "torch_version", "mujoco_ver
 
 @dataclass
 class ComparedRun:
-    """One side of a comparison: a training, or one setting of a run that has episodes.
+    """One of the two things that are compared: a training, or one setting of a run that has episodes.
 
     Attributes:
         name: Name to print.
@@ -87,7 +87,7 @@ def pairs_to_compare(database: Database, first: str, second: str) -> list[tuple[
     Args:
         database: The database.
         first: Id of the first run, or `ID:LABEL` for one of its settings.
-        second: The same for the second run.
+        second: Id of the second run, or `ID:LABEL` for one of its settings.
 
     Raises:
         UsageError: There is no such setting, a run has no episodes, or only one of the runs is a training.
@@ -115,7 +115,7 @@ def compare(first: ComparedRun, second: ComparedRun) -> Row:
         A dictionary with these keys:
 
         - `first` and `second`: the two names
-        - `settings`: every key whose values differ, with both values. A value is None if that side lacks the key.
+        - `settings`: every key whose two values differ, with both values. A value is None where the key is missing.
         - `results`: for each measure both values, the change, and the change's 95 % interval if it is known
         - `note`: why there is no ratio of times. Empty if there is a ratio.
 
@@ -188,7 +188,7 @@ def _interval(change: Estimate, what: str) -> Row:
 def same_tokens(first: Study, second: Study) -> tuple[int, int]:
     """Return two counts: shared episodes with equal tokens, and all shared episodes.
 
-    An episode is shared if both studies have one with its label, task, seed and repeat.
+    An episode is shared if both studies have an episode with the same label, task, seed and repeat.
 
     Raises:
         UsageError: A study has no episode.

@@ -33,12 +33,12 @@ def export(run: RunEntry, database: Database, to: str, folder: Path) -> list[Pat
     Args:
         run: A sweep, rollout or import.
         database: The database that has the run.
-        to: One of FORMATS. `trace` is a JSON file with one line per decode (docs/trace.md).
+        to: One of FORMATS. `trace` is a text file with one line of JSON per decode (docs/trace.md).
         folder: Folder to write to.
 
     Raises:
         UnknownName: There is no such format.
-        UsageError: The run has no episodes. Or `to` is `trace` and the chunks differ in length.
+        UsageError: The run has no episodes. Or `to` is `trace` and the policy's chunks differ in length (FAST tokens).
         StorageError: The disk is full or not writable.
     """
     if to not in FORMATS:
@@ -85,7 +85,7 @@ def _to_trace(store: Study, frame: pd.DataFrame, path: Path) -> None:
     """Write every decode of a study's episodes as a line of a trace (docs/trace.md).
 
     Raises:
-        UsageError: The chunks of a setting differ in length.
+        UsageError: The chunks of a setting's policy differ in length (FAST tokens).
     """
     settings = {one.label: one.settings for one in store.load().settings}
     with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8") as file:
@@ -102,7 +102,10 @@ def _to_trace(store: Study, frame: pd.DataFrame, path: Path) -> None:
 
 
 def _decodes(store: Study, episodes: pd.DataFrame, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yield the decodes of some episodes, with the episode's name in `episode`. Read a hundred episodes at a time."""
+    """Yield the decodes of some episodes as dictionaries. The key `episode` has the text TASK/SEED/REPEAT.
+
+    A hundred episodes are read at a time.
+    """
     for start in range(0, len(episodes), _AT_ONCE):
         some = episodes.iloc[start : start + _AT_ONCE]
         names = [f"{task}/{seed}/{repeat}" for task, seed, repeat in some[["task", "seed", "repeat"]].to_numpy()]
@@ -124,7 +127,7 @@ def _line(row: Mapping[str, Any], levels: int) -> dict[str, Any]:
 
     Args:
         row: Columns `READ` of the decode.
-        levels: Levels of a drafted tree. Used for episodes of older versions of kerv, whose rounds have no levels.
+        levels: Number of levels of a drafted tree, for episodes of older versions of kerv, which did not store it.
     """
     seconds = {phase: row[f"seconds.{phase}"] for phase in READ_PHASES if row[f"seconds.{phase}"] is not None}
     rounds = []

@@ -27,9 +27,9 @@ MICRO = "micro over tasks"
 MACRO = "macro over difficulty groups"
 ONE_TASK = "one task"
 _GROUPS = {MICRO: ["label"], MACRO: ["label"], ONE_TASK: ["task", "label"]}
-"""Way of averaging -> columns that form the groups of episodes of which a row is measured."""
+"""Way of averaging -> columns by which episodes are grouped. Each group becomes one row of a table."""
 RATIO = "ratio"
-"""Key of a measure's metadata: the columns of the episodes whose sums are its numerator and its denominator."""
+"""Key of a measure's metadata. Its value is two columns of the episodes: their sums are numerator and denominator."""
 
 
 @dataclass(frozen=True)
@@ -37,18 +37,18 @@ class Measures:
     """The measured values of a group of episodes. A measure without data is NaN.
 
     Attributes:
-        successes: Number of solved worlds. Repeats measure the same world again and are not counted.
+        successes: Number of solved initial states. Repeats of an initial state are not counted.
         success: Success rate.
-        time_per_step_ms: Inference time per control step.
-        time_per_episode_ms: Inference time per episode.
+        time_per_step_ms: Inference time per control step, milliseconds.
+        time_per_episode_ms: Inference time per episode, milliseconds.
         phases: Time per control step in milliseconds, by phase of a decode. Keys begin with `ms.`.
         steps_to_success: Mean number of control steps of the episodes that succeeded.
         path_m: Mean length of the end effector's path in the episodes that succeeded, metres.
         jerk: Mean of the episodes' root mean square jerk of the end effector, m/s³.
         near_contact_failure: Share of the failures in which the hand came near the object.
-        latency_p50_ms: Median time of a decode.
-        latency_p95_ms: 95th percentile of the time of a decode.
-        latency_worst_ms: Time of the slowest decode.
+        latency_p50_ms: Median time of a decode, milliseconds.
+        latency_p95_ms: 95th percentile of the time of a decode, milliseconds.
+        latency_worst_ms: Time of the slowest decode, milliseconds.
         AL: Acceptance length, tokens per verification.
         accepted_per_round: Accepted draft tokens per verification.
         AFEP: Mean position of a draft's first rejected token.
@@ -57,16 +57,16 @@ class Measures:
         unverified_share: Share of executed tokens that the target did not verify.
         compensation_rate: Share of decodes in which a prediction, not the target, filled in tokens.
         retrieval_share: Share of decodes in which retrieval drafted.
-        deviation: Mean absolute difference between the executed actions and those of AR (autoregressive
+        deviation: Mean absolute difference between the executed actions and the actions of AR (autoregressive
             decoding), in normalised units.
-        felt_latency_ms: Mean time that the world went on during a decode.
+        felt_latency_ms: Mean time in milliseconds that the world went on during a decode.
         felt_latency_steps: Mean number of control steps that the world went on during a decode.
         held_share: Share of control steps that repeated the last action, because no newer one had arrived.
         added: Values of the columns that plugins add, by name.
         counts: Outcomes of the pairs with the baseline.
         mcnemar_p: p-value of McNemar's exact test. NaN if there are no pairs.
-        difference: Success rate minus the baseline's.
-        margin: Loss of success below which a setting counts as non-inferior to the baseline.
+        difference: Success rate minus the baseline's success rate.
+        margin: Loss of success, as a share of episodes, below which a setting counts as non-inferior to the baseline.
         non_inferior: Whether the loss of success is shown to be smaller than `margin`.
         pairs_to_settle: Number of pairs that would show a loss below `margin`, see `statistics.pairs_to_settle`.
         same_run: Whether the two episodes of every pair come from one run.
@@ -74,9 +74,9 @@ class Measures:
         steps: Number of control steps.
         decodes: Number of decodes.
         deviation_samples: Number of decodes whose deviation was measured.
-        speedup: Speed per control step against the baseline, see `measures.speedups`.
-        episode_speedup: Speed per episode against the baseline.
-        solved_speedup: Speed per episode against the baseline, over the pairs in which both solved the task.
+        speedup: Speed per control step relative to the baseline, see `measures.speedups`.
+        episode_speedup: Speed per episode relative to the baseline.
+        solved_speedup: Speed per episode relative to the baseline, over the pairs in which both solved the task.
     """
 
     successes: int
@@ -134,13 +134,14 @@ class Measures:
 class Result:
     """One row of a study's table: a setting, over all tasks or on one task.
 
-    If episodes differ in the value of a text field, semicolons join the values.
+    If episodes differ in the value of a text field, the field holds all values, joined by semicolons.
 
     Attributes:
         study: Name of the study.
-        averaging: MICRO if all episodes are pooled, MACRO if difficulty groups are averaged, or ONE_TASK.
+        averaging: MICRO if all episodes are pooled, MACRO if difficulty groups are averaged, ONE_TASK if the row is of
+            one task.
         label: Label of the setting.
-        series: Name shared by all settings that differ only in the value on the study's axis.
+        series: Name shared by all settings that differ only in the value of the study's axis (x axis of its chart).
         unstressed: Label of the same setting without stress.
         method: The setting's decoding method.
         task: Names of the tasks.
@@ -149,11 +150,11 @@ class Result:
         seeds: Seeds of the episodes, as `seeds_text` writes them.
         repeats: How often every episode was measured.
         episodes: Number of episodes.
-        baseline: Label of the setting that this one is compared with.
+        baseline: Label of the setting that this setting is compared with.
         measures: Measured values.
         runs: Number of runs (commands) from which the intervals of speed were computed.
         overrides: Overrides of the setting, as typed.
-        settings: The setting, with dotted keys.
+        settings: All settings as one dictionary with dotted keys, such as `threshold.r`.
         observation: What the target observes.
         hashes: Hashes of weights and data, by column (`target_sha256`).
         stress: Kind of stress, or `none`.
@@ -188,7 +189,7 @@ class Result:
 
     @property
     def where(self) -> str:
-        """The task if the row is of one task, else the way of averaging."""
+        """The task's name if the row is of one task, else the way of averaging."""
         return self.averaging if self.averaging in (MICRO, MACRO) else self.task
 
     @property
@@ -203,7 +204,7 @@ class Result:
 
     @property
     def speed(self) -> float:
-        """Speed per episode against the baseline. 1 for the baseline itself, NaN if it was not measured."""
+        """Speed per episode relative to the baseline. 1 for the baseline itself. NaN if the speed was not measured."""
         return 1.0 if self.is_baseline else self.measures.episode_speedup.value
 
 
@@ -279,7 +280,7 @@ def measure(
         averaging: MACRO computes a measure for every difficulty group and returns the unweighted mean of the groups.
             MICRO and ONE_TASK pool the episodes of a setting. Paired counts, McNemar's p and `pairs_to_settle` are
             always pooled.
-        speeds: Speedups by group. None: `speedups` computes them from `pairs`.
+        speeds: Speedups by group. If None, `speedups` computes them from `pairs`.
 
     Returns:
         The measures by group: by label, or with ONE_TASK by task and label.
@@ -343,21 +344,21 @@ def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame
     """Pair each setting's episodes with the episodes of its baseline.
 
     Two episodes form a pair if they have the same task, seed, repeat, initial state, device, number format and number
-    of threads. Episodes that were run by a foreign policy server name no device; they pair with episodes of any device.
+    of threads. Episodes from another project's policy server name no device. They pair with episodes of any device.
 
     Args:
         episodes: Episodes of all settings and baselines.
-        baselines: Maps a setting's label to the label of its baseline. Other settings are left out.
+        baselines: Maps a setting's label to the label of its baseline. Settings without a baseline are left out.
 
     Returns:
         One row per pair, sorted by task, seed and repeat. It has these columns:
 
         - `label`, `task`, `difficulty`, `seed`, `repeat`, `decodes` (whether the setting runs a decoder), `same_run`
           and `same_block`
-        - for each side, with the ending _baseline or _method: `time` (seconds per control step), `seconds` (of the
-          whole episode), `block` and `success`
-        - the four outcomes of `PairedCounts`: 1 for the outcome of this pair, 0 for the others. In repeats, which
-          measure the same world again, all are 0.
+        - for each of the two episodes, with the ending _baseline or _method: `time` (seconds per control step),
+          `seconds` (of the whole episode), `block` and `success`
+        - the four outcomes of `PairedCounts`: 1 for the outcome of this pair, 0 for the three other outcomes. All four
+          are 0 in repeats, which measure the same initial state again.
     """
     keys = ["task", "seed", "repeat"]
     columns = ["label", *keys, "run", "block", "success", "seconds", "initial_state", *COMPARABLE]
@@ -426,9 +427,9 @@ def speedups(pairs: pd.DataFrame, averaging: str = MICRO, all_pairs: bool = Fals
 
     Args:
         pairs: Table made by `paired`.
-        averaging: ONE_TASK: a group is a task and a label; otherwise a label. MACRO: a mean time is the mean of the
-            difficulty groups' means; otherwise the mean of all pairs.
-        all_pairs: Whether to use pairs that were not measured in one block (side by side in one process), too.
+        averaging: With ONE_TASK, a group is a task and a label. Otherwise, a group is a label. With MACRO, a mean time
+            is the mean of the difficulty groups' means. Otherwise, a mean time is the mean of all pairs.
+        all_pairs: Whether to use also pairs that were not measured in one block (side by side in one process).
     """
     timed = pairs if all_pairs else pairs[pairs["same_block"]]
     blocks = timed["block_method"].astype(str) + "|" + timed["block_baseline"].astype(str)
@@ -454,7 +455,7 @@ def speedups(pairs: pd.DataFrame, averaging: str = MICRO, all_pairs: bool = Fals
 
 
 def _means(episodes: pd.DataFrame, by: list[str]) -> pd.DataFrame:
-    """Return the measures that need no baseline, pooled over the episodes of each group. Times are in milliseconds."""
+    """Return the measures, except success, that need no baseline, pooled over each group. Times are in milliseconds."""
     groups = episodes.groupby(by)
     per_step, solved = 1000.0 / episodes["steps"], episodes["success"].astype(bool)
     distances = episodes["closest_approach"].astype(float)

@@ -1,8 +1,8 @@
 """Draw the charts of a study from its tables: interactive ones for the page, and PNG files.
 
-A chart has panels side by side. Each of its points is a setting, with these fields: `setting`, `line`, `x`, `value`,
-`low` and `high` (95 % interval), `is_baseline`, and the text that hovering shows. The page sets the parameter `picked`
-to the setting that was clicked.
+A chart has panels side by side. Each point of a panel is a setting and has these fields: `setting`, `line`, `x`,
+`value`, `low` and `high` (95 % interval), `is_baseline`, and the text that hovering shows. When the reader clicks on a
+setting, the page sets the chart's parameter `picked` to the setting's label.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def study_figures(results: Sequence[Result], axis: str, loss: float = 3.0) -> di
 
     Args:
         results: The study's rows over all tasks.
-        axis: Table column for the x axis, such as `threshold.r`. Empty: none.
+        axis: Table column for the x axis, such as `threshold.r`. Empty if the study has no axis.
         loss: Largest acceptable loss of success, in points.
 
     Returns:
@@ -106,7 +106,7 @@ def with_lines(rows: pd.DataFrame, axis: str) -> pd.DataFrame:
 
 
 def _points(rows: pd.DataFrame, column: str) -> pd.DataFrame:
-    """Return the points of a chart that shows one column of the table. Success is in per cent."""
+    """Return the points of a chart that shows one `column` of the table. Success is scaled to per cent."""
     scale = 1.0 if column == SPEED else 100.0
     texts = rows.filter(regex="^text ").columns
     points = rows.reindex(columns=["setting", "line", "x", "panel", "is_baseline", *texts])
@@ -124,7 +124,7 @@ def _tooltip(points: pd.DataFrame) -> list[alt.Tooltip]:
 def _faded(full: float) -> alt.When:
     """Return the opacity of a point, for Altair to evaluate in the browser.
 
-    It is 0.12 if the reader has clicked on another setting, and `full` otherwise.
+    The opacity is 0.12 if the reader has clicked on another setting, and `full` otherwise.
     """
     return alt.when("picked == '' || picked == datum.setting").then(alt.value(full)).otherwise(alt.value(0.12))
 
@@ -132,8 +132,8 @@ def _faded(full: float) -> alt.When:
 def _tradeoff(rows: pd.DataFrame, loss: float) -> alt.ConcatChart:
     """Draw speed and change in success of every setting in two panels, one row per setting.
 
-    A dashed line marks the speed of the baseline in one panel, and a loss of `loss` points in the other. A setting
-    whose interval is right of the line is shown to be faster, or to lose less.
+    A dashed line marks the baseline's speed in the first panel, and a loss of `loss` points in the second. A setting
+    whose interval is right of the line is shown to be faster than the baseline, or to lose less than `loss`.
     """
     baselines = rows["baseline"].unique()
     than = f"than {baselines[0]}" if len(baselines) == 1 else "than the baseline"
@@ -173,7 +173,7 @@ def lines_figure(measures: Iterable[pd.DataFrame], xlabel: str, ylabel: str | No
         measures: Tables of points, from `_points`. Points with the same `panel` share a panel. A point without x is
             drawn as a line across the panel.
         xlabel: Title of the x axis.
-        ylabel: Title of the y axis. None: the y axis has no title.
+        ylabel: Title of the y axis. If None, the y axis has no title.
     """
     points = pd.concat(measures)
     names = points["line"].unique()
@@ -202,8 +202,8 @@ def lines_figure(measures: Iterable[pd.DataFrame], xlabel: str, ylabel: str | No
 def latency_figure(results: Sequence[Result], latencies: pd.DataFrame) -> alt.ConcatChart:
     """Draw success against decoding latency, with one panel per kind of delay compensation.
 
-    Only settings whose world goes on during a decode are drawn. The x of a setting is the latency of the AR baseline
-    under the same clock. So all methods that ran under one clock have the same x.
+    Only settings whose world goes on during a decode are drawn. A setting's x value is the latency of the AR baseline
+    under the same clock. So all methods that ran under the same clock have the same x value.
 
     Args:
         results: The study's rows over all tasks.
@@ -224,7 +224,8 @@ def acceptance_figure(tallies: Mapping[str, Tally], references: Mapping[str, str
     """Draw how many draft tokens were accepted, in three panels with a line per setting.
 
     The first two panels show the share of accepted tokens, by position in the draft and by DoF. They count only tokens
-    whose predecessors in the draft were all accepted. The third shows the share of drafts by number of accepted tokens.
+    whose predecessors in the draft were all accepted. The third panel shows the share of drafts with each number of
+    accepted tokens.
 
     Args:
         tallies: Counts by the setting's label.
@@ -263,7 +264,7 @@ CURVES = {
     "acceptance_length_strict": "accepted tokens, equal only",
     "acceptance_length_r9": "accepted tokens, within 9 bins",
 }
-"""Column of a training's log -> what a chart calls it."""
+"""Column of a training's log -> its title in a chart."""
 
 
 def curves_figure(log: pd.DataFrame) -> alt.ConcatChart:
@@ -283,7 +284,7 @@ def curves_figure(log: pd.DataFrame) -> alt.ConcatChart:
 
 
 def _chart(panels: list[alt.LayerChart], across: int) -> alt.ConcatChart:
-    """Put panels side by side, `across` in a row. Add the look of all charts, and the parameter `picked`."""
+    """Put panels side by side, `across` in a row. Add the style that all charts share, and the parameter `picked`."""
     chart = alt.concat(*panels, columns=across, spacing=28, config=_CONFIG)
     chart.params = [alt.param("picked", value="").param]  # `add_params` would copy the panels again and again
     return chart

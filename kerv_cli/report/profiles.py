@@ -16,7 +16,7 @@ from kerv_cli.engine.cost import Profile, read_profile
 _SHIPPED = "-profile.json"
 _EIGHT_MS = 0.008  # what HeiSD's encoder takes on an A100 (arXiv 2603.17573)
 ENCODERS = {"encoder_floor": "its floor", "encoder_twice": "twice its floor", "encoder_8ms": "8 ms"}
-"""Column with the speed per episode at another cost of the target's encoder -> that cost, in words."""
+"""Table column with a speed per episode -> the time that the vision encoder is assumed to take, in words."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class NamedProfile:
     Attributes:
         name: The name by which the user chose it (`on=NAME`).
         profile: Seconds of each operation of a decode.
-        bounds: What takes most of the time of `encode`, `prefill` and `verify` (one further token), such as `reading`.
-            Empty if the costs were measured.
+        bounds: For `encode`, `prefill` and `verify` (of one further token), what takes most of the time, such as
+            `reading` (the weights). Empty if the costs were measured.
     """
 
     name: str
@@ -41,14 +41,14 @@ class NamedProfile:
 
     @property
     def title(self) -> str:
-        """Target and device. If the costs were computed, not measured, the engine and "projected" follow."""
+        """Target, device and engine, as far as they are known. "projected" follows if the costs were computed."""
         about = self.profile.about
         names = [str(about[key]) for key in ("target", "device_name", "engine") if about.get(key)]
         return ", ".join(names or [self.name]) + (", projected" if self.is_projected else "")
 
     @property
     def encoders(self) -> dict[str, Profile]:
-        """One profile for each key of `ENCODERS`. It assumes another time of the vision encoder.
+        """For each key of `ENCODERS`, the same profile with another time of the vision encoder.
 
         These times are the encoder's floor, twice the floor, and eight milliseconds. The floor is the shortest time
         that the device's bandwidth and arithmetic allow. The engine's system time is added to each. Empty if the
@@ -67,10 +67,11 @@ class NamedProfile:
         Args:
             tokens: N, number of tokens of the chunks to price.
             kinds: Kinds of costs that are needed, such as `verify`.
-            setting: Label of the setting whose decodes are priced, for the message. Empty: no setting is named.
+            setting: Label of the setting whose decodes are priced, for the message. If empty, no setting is named.
 
         Raises:
-            UsageError: The message names the missing cost and the command that measures it.
+            UsageError: A cost is missing, or the costs are for shorter chunks. The message names what is missing and
+                the command that measures it.
         """
         command = f"kerv bench target={self.profile.about.get('target', 'TARGET')} tokens={tokens}"
         if lacks := self.profile.lacks(kinds):
@@ -88,10 +89,10 @@ def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfil
 
     Args:
         results: Results folder.
-        names: Each is a path, the name of a document in <results>/bench, or the name of a profile that kerv ships.
+        names: Each name is a path, the name of a file in <results>/bench, or the name of a profile that kerv ships.
 
     Raises:
-        UsageError: There is no such document, it has no profile, or another version of kerv wrote it.
+        UsageError: There is no such file, the file has no profile, or another version of kerv wrote it.
     """
     folders = (Path(results) / "bench", shipped_dir().parent / "bench")
     profiles = []

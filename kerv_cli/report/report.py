@@ -54,7 +54,7 @@ CSV_COLUMNS = (
     "mcnemar_p", "difference", "difference_low", "difference_high", "non_inferior", "pairs_to_settle",
     "steps_to_success", "near_contact_failure", "matched_success_speed",
 )  # fmt: skip
-"""Columns of a study's CSV files. The remaining values are in tables/<study>.json (`further_of`)."""
+"""Columns of a study's CSV files. All other values are in tables/<study>.json (`further_of`)."""
 LOSS = 3.0
 """Default for the largest loss of success that the page's verdict accepts, in points."""
 _FRAMES = 240
@@ -66,7 +66,7 @@ def to_report(database: Database, study: str | None) -> list[Study]:
 
     Args:
         database: The database.
-        study: Name of one study. None: every study that has at least one episode, sorted by name.
+        study: Name of one study. If None, return every study that has at least one episode, sorted by name.
 
     Raises:
         UsageError: No study has an episode.
@@ -86,8 +86,8 @@ class Report:
     Attributes:
         data: The study with its tables.
         loss: Largest loss of success, in points, that the verdict accepts.
-        priced: The study's speeds on other machines. Empty: none were estimated.
-        files: Written files, in the order of writing, the page last. Empty: nothing was written.
+        priced: The study's speeds on other machines. Empty if none were estimated.
+        files: Written files, in the order of writing, the page last. Empty if nothing was written.
     """
 
     data: StudyData
@@ -104,7 +104,8 @@ class Report:
     def command_to_settle(self) -> str:
         """The command that runs enough episodes for the verdict to name a setting.
 
-        Empty if the verdict names one already, if more episodes would not help, or if the study is not a sweep.
+        Empty if the verdict names a setting already, if more episodes would not help, if more than 10,000 pairs would
+        be needed, or if the study is not a sweep.
         """
         study, episodes = self.data.study, self.verdict.episodes
         return study.sweep_command(f"episodes={episodes}") if study.kind == SWEEP and episodes else ""
@@ -139,7 +140,7 @@ def report(
 
     Args:
         database: The database. Files are written to its results folder.
-        study: Name of the study. None: all studies.
+        study: Name of the study. If None, report on all studies.
         publish: Write tables and plots into the results folder itself instead of its report/. Refused for studies that
             do not meet the conditions for publishing.
         on: Names of cost profiles of other machines. The study's speeds on each are estimated (docs/measuring.md).
@@ -170,8 +171,8 @@ def write_study(data: StudyData, loss: float, profiles: Sequence[NamedProfile] =
     Args:
         data: The study with all its episodes.
         loss: Largest loss of success, in points, that the verdict accepts.
-        profiles: Cost profiles of the machines for which speeds are estimated. Empty: the profiles that the study's
-            file names, and measured profiles of the machine that ran the study.
+        profiles: Cost profiles of the machines for which speeds are estimated. If empty, use the profiles that the
+            study's file names, and measured profiles of the machine that ran the study.
         publish: Write tables and plots into the results folder itself instead of its report/.
 
     Raises:
@@ -215,7 +216,7 @@ class Unpublishable(KervError):
 
 
 def refusals(results: Sequence[Result]) -> list[str]:
-    """Return the reasons why a study may not be published, as clauses of an error message. Empty: it may be published.
+    """Return the reasons why a study may not be published, as clauses of an error message. Empty if there are none.
 
     Args:
         results: The study's rows over all tasks.
@@ -239,15 +240,16 @@ def further_of(data: StudyData) -> dict[str, Any]:
     """Return the facts about a study that its CSV files leave out, as JSON values.
 
     Returns:
-        A dictionary with the keys `study` (its name), `axis` (key of the plots' x axis) and `labels`. The last maps
-        each setting's label to a dictionary:
+        A dictionary with the keys `study` (its name), `axis` (key of the plots' x axis) and `labels`. The value of
+        `labels` maps each setting's label to a dictionary with these keys:
 
         - `name`, `overrides` and `settings` of the setting
-        - `varies`: values of the keys that differ within its grid (the settings that one entry of the study expands to)
+        - `varies`: the keys that differ between the settings of the same grid, with this setting's values. A grid is
+          the settings that one entry of the study expands to.
         - `identity`: hashes of weights and data
         - `provenance`: executor, machine, versions and the like
         - `measures`: for each averaging and each task, the measures that have no column in the CSV files
-        - `acceptance`: how many draft tokens were accepted, over all tasks; only if drafts were verified
+        - `acceptance`: how many draft tokens were accepted, over all tasks. Missing if no drafts were verified.
     """
     labels: dict[str, Any] = {}
     for row in [*data.results, *data.task_results]:
@@ -276,7 +278,7 @@ def further_of(data: StudyData) -> dict[str, Any]:
 def summed_table(results: Iterable[Result]) -> pd.DataFrame:
     """Pool a study's stressed episodes in three ways: by kind of stress, by level, and all together.
 
-    Each pooled row is compared with the baseline's episodes in the same worlds under the same stresses.
+    Each pooled row is compared with the baseline's episodes from the same initial states under the same stresses.
 
     Returns:
         One row for each method and each way of pooling. `method` is the setting's label without stress. `sum` says what
@@ -351,9 +353,9 @@ def study_parts(report: Report) -> dict[str, Any]:
 
 
 def _settings(data: StudyData) -> list[dict[str, Any]]:
-    """Return for every setting its label, its overrides, its reference, and the values that differ between the two.
+    """Return for every setting: label, overrides, reference, and the values that differ from the reference's values.
 
-    The reference is the label of the setting that it is compared with.
+    The reference is the setting with which this setting is compared.
     """
     flat = {label: flatten(without(one.settings, NOT_DETERMINING)) for label, one in data.settings.items()}
     settings = []
@@ -367,8 +369,9 @@ def _settings(data: StudyData) -> list[dict[str, Any]]:
 def _films(data: StudyData) -> list[dict[str, Any]]:
     """Return for each method a film of its first recorded success and one of its first recorded failure.
 
-    A method without a recording of such an episode lacks that film. Without Rerun there are no films. A film is a
-    dictionary with the setting's label, the task, the seed, the outcome, the number of steps and the GIF in base64.
+    A method without a recorded success, or without a recorded failure, lacks that film. Without Rerun there are no
+    films. A film is a dictionary with the setting's label, the task, the seed, the outcome, the number of steps and
+    the GIF in base64.
     """
     if not has_rerun():
         return []
@@ -389,5 +392,5 @@ def _films(data: StudyData) -> list[dict[str, Any]]:
 
 
 def _href(folder: Path, path: Path) -> str:
-    """Return the address of a file relative to the page's folder."""
+    """Return the address of the file `path` for a link in a page, relative to the page's `folder`."""
     return quote(Path(os.path.relpath(path, folder)).as_posix())

@@ -1,7 +1,7 @@
 """Estimate what a study's decodes would cost on another machine or with another target (docs/measuring.md).
 
-The estimate assumes that each setting would decode the same tokens in the same control steps there. It reads the costs
-from a profile: a file of `kerv bench` with the seconds that each operation of a decode takes on a machine.
+The estimate assumes that each setting would decode the same tokens in the same control steps there. The costs are from
+a profile: a file that `kerv bench` writes, with the seconds that each operation of a decode takes on a machine.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ READ = ("index", "rounds", "similarity", *map("seconds.{}".format, READ_PHASES))
 
 @dataclass(frozen=True)
 class Priced:
-    """How fast a setting would be on another machine, estimated from a cost profile (file of `kerv bench`).
+    """How fast a setting would be on another machine, estimated from a cost profile (written by `kerv bench`).
 
     Attributes:
-        result: The setting's row as measured, pooled over tasks.
+        result: The setting's row of the study's table, as measured, pooled over tasks.
         machine: The cost profile of the other machine.
         measures: The measures of `result`, estimated for the machine.
         encoders: Estimated speeds per episode with other times of the vision encoder, by the keys of `ENCODERS`. Empty
@@ -66,10 +66,10 @@ def repriced(data: StudyData, profiles: Sequence[NamedProfile], lenient: bool = 
     Args:
         data: The study's episodes.
         profiles: For each machine, the seconds that each operation of a decode takes there (`kerv bench`).
-        lenient: Leave out a profile that lacks a cost, instead of refusing it.
+        lenient: Leave out a profile that lacks a cost, instead of raising an error.
 
     Returns:
-        One row per profile and setting. Settings that run no decoder are left out.
+        One estimate per profile and setting. Settings that run no decoder are left out.
 
     Raises:
         UsageError: A profile lacks a cost that the study needs, or has costs for shorter chunks only. Or a setting has
@@ -101,7 +101,7 @@ def repriced(data: StudyData, profiles: Sequence[NamedProfile], lenient: bool = 
 
 
 def _estimated(data: StudyData, works: Mapping[str, _LabelWork], profile: Profile) -> dict[Hashable, Measures]:
-    """Return the measures of every setting, by its label, with the times of its decodes computed from a profile."""
+    """Return the measures of every setting, by label. The times of the decodes are computed from a profile."""
     episodes = data.episodes
     priced = pd.concat([_priced(episodes[episodes["label"] == label], work, profile) for label, work in works.items()])
     pairs = paired(priced, data.references)
@@ -109,10 +109,11 @@ def _estimated(data: StudyData, works: Mapping[str, _LabelWork], profile: Profil
 
 
 def own_prices(data: StudyData, elsewhere: bool = True) -> list[Priced]:
-    """Return the study's speeds, estimated for the machines that the study's file names and for its own machines.
+    """Return the study's speeds, estimated for the machines that the study's file names and for those that ran it.
 
-    Estimates for a study's own machine need a profile of `kerv bench` that was measured there. Comparing them with the
-    measured times shows how accurate the cost model is. A profile that is missing or lacks a cost is left out.
+    For a machine that ran the study, this needs a profile that `kerv bench` measured on that machine. Comparing such
+    estimates with the measured times shows how accurate the cost model is. A profile that is missing or lacks a cost
+    is left out.
 
     Args:
         data: The study's episodes.
@@ -136,7 +137,7 @@ def own_prices(data: StudyData, elsewhere: bool = True) -> list[Priced]:
 
 
 class _LabelWork(NamedTuple):
-    """Operations that all decodes of a setting executed.
+    """The operations that each decode of a setting executed.
 
     Attributes:
         work: The forwards and drafts of each decode, and the recorded seconds of everything else.
@@ -181,9 +182,9 @@ def _work_of_label(data: StudyData, label: str) -> _LabelWork:
 
 
 def levels_of(settings: Mapping[str, Any]) -> int:
-    """Return the number of levels of the trees that a setting drafts. 0: the setting drafts chains.
+    """Return the number of levels of the trees that a setting drafts. It is 0 if the setting drafts no trees.
 
-    This is needed for episodes of older versions of kerv, whose stored rounds do not have this number.
+    It is needed for episodes of older versions of kerv, whose stored rounds do not have this number.
     """
     proposer = settings.get("proposer", {})
     return int(proposer["depth"]) if proposer.get("shape") == "tree" else 0
@@ -192,7 +193,7 @@ def levels_of(settings: Mapping[str, Any]) -> int:
 def _priced(episodes: pd.DataFrame, work: _LabelWork, profile: Profile) -> pd.DataFrame:
     """Return the episodes with the times that their decodes would take at the profile's costs.
 
-    The columns `seconds` (of all decodes) and `decode_seconds` (of each decode) are replaced.
+    The columns `seconds` (sum over all decodes) and `decode_seconds` (array with one number per decode) are replaced.
     """
     seconds = prices(work.work, profile)
     total = np.bincount(work.episode, seconds, len(episodes))

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 
 class Estimate(NamedTuple):
-    """An estimated value with the lower and upper end of its confidence interval (95 % unless said otherwise)."""
+    """An estimated value with the lower and the upper end of its confidence interval (95 % by default)."""
 
     value: float
     low: float
@@ -41,7 +41,7 @@ class PairedCounts(NamedTuple):
 
 NO_ESTIMATE = Estimate(math.nan, math.nan, math.nan)
 MOST_PAIRS = 10_000
-"""Above this number of pairs, messages say only "more than 10,000", because nobody runs that many."""
+"""Above this number of pairs, messages say only "more than 10,000", because nobody runs so many pairs."""
 
 
 def wilson(successes: float, episodes: float, confidence: float = 0.95) -> Estimate:
@@ -75,10 +75,11 @@ def mean_of(groups: Sequence[Estimate]) -> Estimate:
     (method of variance estimates recovery: Zou and Donner, Statistics in Medicine 27, 2008).
 
     Args:
-        groups: One estimate per group. NaN: the group has none. All intervals, the result's too, have one confidence.
+        groups: One estimate per group. It is NaN if the group's value is unknown. All intervals have the same
+            confidence, and so has the result's interval.
 
     Returns:
-        The mean of the known estimates with its interval. All three numbers are NaN if there are none.
+        The mean of the known estimates with its interval. All three numbers are NaN if no estimate is known.
     """
     table = np.array(groups)
     known = table[~np.isnan(table[:, 0])]
@@ -101,7 +102,8 @@ def paired_difference(counts: PairedCounts) -> Estimate:
         counts: Outcomes of the pairs.
 
     Returns:
-        The difference, from −1 to 1. Negative: the method succeeds less often. All NaN if there are no pairs.
+        The difference, from −1 to 1, with its interval. It is negative if the method succeeds less often. All three
+        numbers are NaN if there are no pairs.
     """
     pairs = sum(counts)
     if not pairs:
@@ -124,7 +126,7 @@ def paired_difference(counts: PairedCounts) -> Estimate:
 
 
 def difference(first: Estimate, second: Estimate) -> Estimate:
-    """Estimate the second of two independent success rates minus the first.
+    """Estimate the difference of two independent success rates: the second rate minus the first.
 
     With Wilson intervals this is Newcombe's hybrid score interval (Statistics in Medicine 17, 1998, page 873, method
     10). The distance from the difference to its lower end is the root of the sum of two squared distances: from the
@@ -132,8 +134,8 @@ def difference(first: Estimate, second: Estimate) -> Estimate:
     distances are to the second rate's upper end and to the first rate's lower end.
 
     Args:
-        first: A rate with its interval.
-        second: The other rate. Both intervals and the result's have the same confidence.
+        first: The first rate, with its interval.
+        second: The second rate, with its interval. All intervals have the same confidence, the result's too.
     """
     value = second.value - first.value
     low = value - math.hypot(second.value - second.low, first.high - first.value)
@@ -151,7 +153,7 @@ def pairs_for_power(lost: float, won: float) -> float:
         won: Expected share of pairs in which only the method succeeds.
 
     Returns:
-        The number of pairs. Infinite if it is above MOST_PAIRS.
+        The number of pairs. Infinite if more than MOST_PAIRS are needed.
     """
     from scipy.special import bdtr, bdtrik
 
@@ -172,12 +174,12 @@ def pairs_for_power(lost: float, won: float) -> float:
 def pairs_to_settle(counts: PairedCounts, margin: float) -> float:
     """Estimate how many pairs in all would show that the method loses less than `margin` of success (non-inferiority).
 
-    The estimate assumes that the shares of the four outcomes stay as observed. It is the smallest number of pairs for
-    which the lower end of `paired_difference` is above −margin.
+    The estimate assumes that the shares of the four outcomes stay as observed. The result is the smallest number of
+    pairs for which the lower end of `paired_difference` is above −margin.
 
     Args:
         counts: Observed outcomes of the pairs.
-        margin: Largest acceptable loss of success, as a share of episodes (0.03: three points).
+        margin: Largest acceptable loss of success, as a share of episodes (0.03 stands for three points).
 
     Returns:
         The total number of pairs, including those already run. Infinite if ten million pairs would not be enough. NaN
@@ -198,8 +200,8 @@ def pairs_to_settle(counts: PairedCounts, margin: float) -> float:
 def mcnemar(counts: PairedCounts) -> float:
     """Return the two-sided p-value of McNemar's exact test (McNemar, Psychometrika 12, 1947).
 
-    The test uses only the pairs in which exactly one side succeeded. Under the null hypothesis, each of these pairs is
-    won by the method with probability 1/2. The number of pairs that the method wins is then binomial.
+    The test uses only the pairs in which exactly one of the two episodes succeeded. Under the null hypothesis, the
+    method wins each of these pairs with probability 1/2. The number of pairs that the method wins is then binomial.
 
     Args:
         counts: Outcomes of the pairs.
@@ -264,11 +266,12 @@ def over_runs(estimates: Sequence[Estimate], same_pairs: bool) -> Estimate:
 
     The value is the geometric mean of the k speedups. Its 95 % interval is computed for the logarithm, by Student's t
     with k − 1 degrees of freedom. If all runs have the same pairs, the spread of the runs does not show how much the
-    choice of pairs matters. Then the half width is √(a² + b²): a from Student's t, b the mean of the runs' half widths.
+    choice of pairs matters. In this case the half width is √(a² + b²), where a is the half width by Student's t, and b
+    is the mean of the runs' half widths.
 
     Args:
-        estimates: The speedup in each run, with the interval over its pairs.
-        same_pairs: Whether all runs measured the same pairs. Otherwise each run has its own seeds.
+        estimates: The speedup in each run, with the interval over the run's pairs.
+        same_pairs: Whether all runs measured the same pairs. If not, each run has its own seeds.
     """
     from scipy.special import stdtrit
 
@@ -285,13 +288,13 @@ def _spread(effects: np.ndarray, strata: np.ndarray, clusters: np.ndarray) -> fl
     """Return half the width of the 95 % interval of the logarithm of a speedup.
 
     A pair is a baseline episode and a method episode from the same initial state. Pairs in different clusters are
-    independent. The variance is estimated within each stratum, from the spread of its clusters' sums of `effects`. Then
-    the variances of the strata are added. Strata with only one cluster are merged into one stratum (Cochran, Sampling
-    Techniques, section 5A.12). The half width is the standard deviation times the 97.5 % quantile of Student's t. Its
-    degrees of freedom are the number of clusters minus the number of strata.
+    independent. The effects are summed within each cluster. The variance of a stratum is estimated from the spread of
+    these sums. Then the variances of the strata are added. Strata with only one cluster are merged into one stratum
+    (Cochran, Sampling Techniques, section 5A.12). The half width is the standard deviation times the 97.5 % quantile of
+    Student's t. The degrees of freedom are the number of clusters minus the number of strata.
 
     Args:
-        effects: (n,) effect of each pair on the logarithm of the speedup, to first order. The sum is 0.
+        effects: (n,) effect of each pair on the logarithm of the speedup, to first order. The n effects sum to 0.
         strata: (n,) number of each pair's stratum (task), from 0.
         clusters: (n,) number of each pair's cluster (block), from 0. A cluster is in one stratum.
 

@@ -33,7 +33,7 @@ SPEEDS = {"episode_speedup": "speed, per episode", "speedup": "speed, per step"}
 """Table column of each kind of speed -> its heading."""
 DIFFERENCE = "change in success"
 MAIN = 5
-"""Number of columns that are always shown. `--all`, and "more columns" on the page, show the others."""
+"""Number of columns that are always shown. `--all`, and "more columns" on the page, show all other columns."""
 NOTE = (
     "In brackets: 95 % intervals. Change in success: points against the baseline, from the same initial states. Speed: "
     "times as fast as the baseline. Slowest 5 % of decodes: they take at least this many ms."
@@ -61,7 +61,7 @@ METHODS = {
     "sp_vla": "extrapolates fast motion, the policy decodes slow motion",
     "spec_vla": "a small network drafts a tree of tokens, the policy verifies",
 }
-"""Family of methods -> what it does."""
+"""Family of methods -> what its methods do."""
 WORDS = {
     "certified": "skips verification only as far as a test of success allows",
     "chain": "drafts one chain of tokens in place of a tree",
@@ -72,7 +72,7 @@ WORDS = {
     "strict": "accepts only tokens that equal the policy's",
     "tuned": "changed by us, to suit these policies",
 }
-"""Word in the name of a setting -> what it says."""
+"""Word in the label of a setting -> what the word means."""
 UNVERIFIED = "executed tokens that the policy neither wrote nor accepted"
 ASSUMES = (
     "Speed against the baseline by the cost model: the recorded decodes at a profile's costs, as if the other machine "
@@ -81,26 +81,26 @@ ASSUMES = (
 
 
 def number(value: float) -> str:
-    """Return a value with three significant digits and no exponent. `–` if it is missing."""
+    """Return a value as text with three significant digits and no exponent. The text is `–` if the value is missing."""
     if not is_number(value):
         return MISSING
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:#.3g}"
 
 
 def share(value: float) -> str:
-    """Return a value from 0 to 1 in per cent. `–` if it is missing."""
+    """Return a value from 0 to 1 as text in per cent. The text is `–` if the value is missing."""
     return f"{100 * value:.0f} %" if is_number(value) else MISSING
 
 
 def interval(estimate: Estimate, form: str = ".2f", unit: str = "", scale: float = 1.0, between: str = "–") -> str:
-    """Return an estimate with its interval in brackets. `–` if it is missing.
+    """Return an estimate as text, with its interval in brackets. The text is `–` if the estimate is missing.
 
     Args:
         estimate: The estimate.
-        form: Format of the numbers. With `.0f` the value still gets one decimal, unless that decimal is 0. So a success
-            of 99.5 % does not read as 100 %. With `.2f`, an estimate of 10 or more gets only one decimal.
+        form: Python format of the numbers. With `.0f`, the value still gets one decimal, unless that decimal is 0. So
+            99.5 % success does not become 100 %. With `.2f`, an estimate of 10 or more gets only one decimal.
         unit: Text after the value.
-        scale: Factor for value and interval; 100 for per cent.
+        scale: Factor for value and interval, such as 100 for per cent.
         between: Text between the two ends of the interval.
     """
     if not is_number(estimate.value):
@@ -115,8 +115,8 @@ def interval(estimate: Estimate, form: str = ".2f", unit: str = "", scale: float
 def _speed(row: Result, speed: Estimate) -> str:
     """Return a speed as text.
 
-    The baseline's speed is 1, or `–` if it was not timed. An asterisk marks a speed for which some pairs were not
-    measured side by side in one block; those pairs do not count.
+    The text for the baseline is `1×`, or `–` if the baseline was not timed. Pairs that were not measured side by side
+    in one block do not count. An asterisk marks a speed with such pairs.
     """
     measures = row.measures
     if row.is_baseline:
@@ -126,7 +126,7 @@ def _speed(row: Result, speed: Estimate) -> str:
 
 
 def cells_of(row: Result) -> dict[str, str]:
-    """Return a row of a study's table as text, by the column's heading. The first `MAIN` columns are always shown."""
+    """Return a row of a study's table as a dictionary from heading to text. The first `MAIN` are always shown."""
     of = row.measures
     return {
         "setting": row.label,
@@ -172,7 +172,7 @@ class SummaryTable:
     Attributes:
         results: The study's rows over all tasks.
         all: Print every column. If they do not fit side by side, they are printed in several parts.
-        how: What to type to see every column. Empty: the table does not mention hidden columns.
+        how: What to type to see every column. If empty, the table does not mention hidden columns.
     """
 
     results: Sequence[Result]
@@ -227,7 +227,7 @@ def _heading(name: str) -> str:
 
 
 def _parts(frame: pd.DataFrame, width: int) -> Iterator[pd.DataFrame]:
-    """Cut a table into parts that fit into `width` characters. The first part has at least name, success and speed."""
+    """Cut a table into parts that fit into `width` characters. The first part always has label, success and speed."""
     widths = {name: 2 + max(map(len, [*_heading(name).split("\n"), *frame[name]])) for name in frame.columns}
     label = min(widths["setting"], 2 + max(_LABEL, *map(len, " ".join(frame["setting"]).split())))
     part = list(frame.columns[:3])
@@ -240,9 +240,10 @@ def _parts(frame: pd.DataFrame, width: int) -> Iterator[pd.DataFrame]:
 
 
 def not_in_turn(results: Sequence[Result]) -> list[str]:
-    """Return labels of settings that were timed but have no speedup.
+    """Return the labels of the settings that were timed but have no speedup.
 
-    In none of their pairs did the two episodes run in one block (side by side in one process).
+    A setting has no speedup if the two episodes of each pair ran in different blocks. A block is episodes that ran side
+    by side in one process.
     """
     apart: dict[str, None] = {}
     for row in results:
@@ -351,10 +352,10 @@ def explained(label: str, method: str = "") -> str:
 
 
 def explanations(settings: Iterable[Setting]) -> dict[str, str]:
-    """Explain a table's settings, and its column *tokens unverified*.
+    """Explain a table's settings, and the table's column *tokens unverified*.
 
     Returns:
-        A dictionary from label or heading to explanation. Settings whose names have no known word are left out.
+        A dictionary from label or heading to explanation. Settings whose labels have no known word are left out.
     """
     found = {}
     for one in settings:

@@ -50,7 +50,7 @@ SOLVED = 0.20
 NO_STRESS = "none"
 _AT_ONCE = 200  # episodes in memory at a time
 _ONE_STATE = ("code", "git_commit", "device_name")
-"""Columns in which runs must agree, to be averaged."""
+"""Columns in which runs must agree. Otherwise their speeds are not averaged."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ class StudyData:
             measured all episodes of the study, or else all settings and tasks on its own seeds. Empty if there are
             fewer than three such runs.
         same_pairs: Whether each run measured all episodes of the study.
-        against: Suffix of the tables' names, such as `_against_ar`, if the user chose another baseline than the
-            study's own. Else empty.
+        against: Suffix of the tables' names, such as `_against_ar`, if the user chose another baseline than the study's
+            own baseline. Otherwise empty.
     """
 
     study: Study
@@ -98,7 +98,7 @@ class StudyData:
         return references_of(self.study.settings, self.study.baseline)
 
     def compared_with(self, label: str) -> StudyData:
-        """Return the study with the setting `label` as its baseline. Its tables are named NAME_against_LABEL.
+        """Return the study with the setting `label` as baseline. The tables are then named NAME_against_LABEL.
 
         Raises:
             UsageError: The study has no such setting.
@@ -128,19 +128,20 @@ class StudyData:
 
     @functools.cached_property
     def pairs(self) -> pd.DataFrame:
-        """Episodes of each setting, paired with those of the setting that it is compared with (`measures.paired`)."""
+        """Episodes of each setting, paired with the episodes of its reference setting (`references`)."""
         return paired(self.episodes, self.references)
 
     @functools.cached_property
     def pairs_of_runs(self) -> list[pd.DataFrame]:
-        """The table `pairs` of each run. `pairs` alone if the runs are not told apart."""
+        """The table `pairs` of each run in `runs`. If `runs` is empty, one table `pairs` over all episodes."""
         return [paired(run, self.references) for run in self.runs] or [self.pairs]
 
     @functools.cached_property
     def by_speed(self) -> list[tuple[str, Estimate]]:
-        """The timed settings, the fastest per episode first, each with its speed per episode against the next slower.
+        """The timed settings by label, the fastest per episode first.
 
-        The slowest has NaN. Empty if the settings are compared with several baselines, or if fewer than two were timed.
+        Each label comes with the speed per episode relative to the next slower setting. The slowest setting has NaN.
+        Empty if the settings are compared with several baselines, or if fewer than two settings were timed.
         """
         timed = [row for row in averaged(self.results) if is_number(row.speed)]
         if len(timed) < 2 or len(set(self.references.values())) > 1:
@@ -153,7 +154,7 @@ class StudyData:
 
     @functools.cached_property
     def tallies(self) -> dict[str, Tally]:
-        """How many draft tokens were accepted, for each setting that verified drafts. Reads all decodes."""
+        """How many draft tokens were accepted, for each setting that verified drafts. This reads all stored decodes."""
         episodes, tallies = self.episodes.groupby("label")["episode"], {}
         for label in self.labels:
             numbers, tally = episodes.get_group(label).tolist(), Tally.of_records((), 0)
@@ -193,12 +194,12 @@ class StudyData:
 def references_of(settings: Sequence[Setting], baseline: str) -> dict[str, str]:
     """Return for each setting's label the label of the setting that it is compared with.
 
-    That is the baseline's method under the same stress and clock, if the study has such a setting. Otherwise it is
-    the study's baseline.
+    A setting is compared with the baseline's method under the same stress and clock, if the study has such a setting.
+    Otherwise the setting is compared with the study's baseline.
 
     Args:
         settings: The study's settings.
-        baseline: Label of its baseline.
+        baseline: Label of the study's baseline.
     """
     same: dict[str, str] = {}
     for own in settings:
@@ -210,12 +211,12 @@ def references_of(settings: Sequence[Setting], baseline: str) -> dict[str, str]:
 
 
 def _conditions_of(setting: Setting) -> str:
-    """Return a setting's stress and its settings `rollout.*` as JSON, to find settings under the same conditions."""
+    """Return the stress and the settings `rollout.*` of a setting as JSON text, to compare conditions."""
     return json.dumps([stress_of(setting.settings), setting.settings["rollout"]], sort_keys=True)
 
 
 def _methods_of(setting: Setting) -> str:
-    """Return everything that determines a setting's results, except stress and the settings `rollout.*`, as JSON."""
+    """Return as JSON text what determines a setting's results, except stress and the settings `rollout.*`."""
     world = without(setting.settings["world"], {"stress"})
     others = without(setting.settings, (NOT_DETERMINING - {"policy"}) | {"world", "rollout"})
     return json.dumps([world, others, dict(setting.identity)], sort_keys=True)
@@ -225,8 +226,8 @@ def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyDa
     """Read a study and its stored episodes.
 
     Args:
-        study: The study. Its name is enough if `wanted` is None.
-        wanted: Episodes to read. Settings without any of them are left out. None: read all episodes.
+        study: The study. Only its name is used if `wanted` is None.
+        wanted: Episodes to read. Settings without any of these episodes are left out. If None, read all episodes.
 
     Raises:
         UsageError: There is no such study, or none of its episodes is stored.
@@ -249,9 +250,9 @@ def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyDa
 
 
 def _with_new_seeds(episodes: pd.DataFrame) -> list[pd.DataFrame]:
-    """Return the episodes of each run, oldest first, if each run measured every setting in every task on its own seeds.
+    """Return one table of episodes per run, the oldest run first, if the runs have different seeds.
 
-    Otherwise return an empty list.
+    Return an empty list if two runs share a seed on a task, or if a run lacks a setting on a task.
     """
     worlds = episodes[["run", "task", "seed"]].drop_duplicates()
     cells = episodes[["run", "label", "task"]].drop_duplicates()
@@ -331,12 +332,12 @@ def _results(data: StudyData, averaging: str) -> list[Result]:
 
 
 def with_matched_speed(rows: Sequence[Result]) -> list[Result]:
-    """Add the matched-success speed: one figure per method and baseline, in each of the method's rows.
+    """Add the matched-success speed: one number per method and baseline, the same in each of the method's rows.
 
     How fast is a method at its fastest setting that keeps success (docs/methods.md §7)? The measure is from
-    WA-SpecDec, arXiv 2608.08725. It is the largest `episode_speedup` of the settings that pass the test with a margin
-    of 3 points. It is missing if no setting passes, or if the settings that pass were not timed. It is also missing for
-    the baseline itself, and if the baseline does not solve the tasks.
+    WA-SpecDec, arXiv 2608.08725. It is the largest `episode_speedup` of the method's settings that pass the test of
+    success with a margin of 3 points. It is missing if no setting passes, or if the settings that pass were not timed.
+    It is also missing for the baseline itself, and if the baseline does not solve the tasks.
 
     Args:
         rows: One row per setting and task, or per setting and way of averaging.
@@ -360,7 +361,7 @@ def with_matched_speed(rows: Sequence[Result]) -> list[Result]:
 
 
 def safety(row: Result) -> tuple[float, float]:
-    """Return the key that sorts settings from the safest on. It does not depend on success.
+    """Return a key for sorting settings, the safest first. The key does not depend on success.
 
     The setting with the smallest unverified share comes first: the share of executed tokens that the target has not
     verified, rounded to whole per cent. Settings that decode nothing come last. Of settings with equal shares, the one
@@ -409,7 +410,10 @@ def flatten(settings: Plain) -> Row:
 
 
 def differences(first: Row, second: Row) -> list[Row]:
-    """Return every `key` whose values differ, with both values: `first` and `second`. None: that side lacks the key."""
+    """Return the keys whose values differ, as dictionaries with `key`, `first` and `second`.
+
+    A value is None if the key is missing there.
+    """
     found = []
     for key in first | second:
         pair = {"key": key, "first": first.get(key), "second": second.get(key)}
@@ -419,7 +423,7 @@ def differences(first: Row, second: Row) -> list[Row]:
 
 
 def _joined(values: Iterable[object]) -> str:
-    """Return all different values as one text, separated by semicolons. None is left out."""
+    """Return all different values except None as one text, separated by semicolons."""
     return ";".join(dict.fromkeys(str(value) for value in values if value is not None))
 
 

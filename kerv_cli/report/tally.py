@@ -24,9 +24,9 @@ class Tally:
 
     Attributes:
         nodes: Number of verified draft tokens. In a tree, tokens that are not on the accepted path count, too.
-        lengths: Entry k: number of verifications that accepted k draft tokens.
-        judged: Entry k: number of verifications that judged k draft tokens. The judged tokens are the accepted ones
-            and, if a token was rejected after them, that token.
+        lengths: Entry k is the number of verifications that accepted k draft tokens.
+        judged: Entry k is the number of verifications that judged k draft tokens. The judged tokens are the accepted
+            tokens and, if a draft token was rejected after them, the first rejected token.
         reached: (D,) number of reached tokens of each DoF.
         accepted: (D,) number of accepted tokens of each DoF.
     """
@@ -43,7 +43,7 @@ class Tally:
 
         Args:
             start: (n,) number of tokens committed before each verification.
-            judged: (n,) number of judged tokens: the accepted tokens and the first rejected one, if any.
+            judged: (n,) number of judged tokens: the accepted tokens, and the first rejected token if there is one.
             accepted: (n,) number of accepted draft tokens.
             nodes: (n,) number of verified draft tokens.
             dofs: Number of DoFs D.
@@ -86,7 +86,7 @@ class Tally:
 
     @property
     def by_position(self) -> tuple[np.ndarray, np.ndarray]:
-        """Two arrays: the number of reached and of accepted tokens at each position in the draft, in order."""
+        """Two arrays: the numbers of reached tokens and the numbers of accepted tokens, by position in the draft."""
         reached, accepted = self.judged[::-1].cumsum()[::-1][1:], self.lengths[::-1].cumsum()[::-1][1:]
         return reached, _sum(np.zeros(len(reached), int), accepted)
 
@@ -111,7 +111,7 @@ class Tally:
 
 
 def rates(reached: np.ndarray, accepted: np.ndarray) -> list[float | None]:
-    """Return accepted ÷ reached tokens at each position. None at positions that no draft reached."""
+    """Return accepted ÷ reached tokens for each position in the draft, or each DoF. None if no token was reached."""
     quotients: list[float | None] = (accepted / np.maximum(reached, 1)).tolist()
     for position in np.flatnonzero(reached == 0):
         quotients[position] = None
@@ -119,7 +119,7 @@ def rates(reached: np.ndarray, accepted: np.ndarray) -> list[float | None]:
 
 
 def _sum(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Add two arrays of counts. The shorter one continues with zeros."""
+    """Add two arrays of counts. The shorter array is extended with zeros."""
     total = np.zeros(max(len(first), len(second)), int)
     for counts in (first, second):
         total[: len(counts)] += counts

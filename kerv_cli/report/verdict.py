@@ -1,11 +1,11 @@
 """Decide which setting of a study to take, and write the sentences that say what the study shows.
 
-The setting is the fastest that is shown to lose little success. The settings of a finished study are tested in a fixed
-order, the safest first. The test ends at the first that fails (fixed-sequence testing). So all tests together have the
-error rate of one test (docs/methods.md §7).
+The setting to take is the fastest setting that is shown to lose little success. The settings of a finished study are
+tested in a fixed order, the safest first. Testing ends at the first setting that fails (fixed-sequence testing). So all
+tests together have the error rate of one test (docs/methods.md §7).
 
-No other module of kerv writes such a sentence. It says *faster*, *slower* or *loses less than* only if a 95 % interval
-shows it. If the baseline succeeds in less than the share `SOLVED` of its episodes, no setting is recommended.
+No other module of kerv writes such sentences. A sentence says *faster*, *slower* or *loses less than* only if a 95 %
+interval shows it. If the baseline's success rate is below `SOLVED`, no setting is recommended.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ class Choice:
         chosen: Fastest setting that is shown to lose less success than the bound. Empty if no setting is.
         loss_at_most: Upper bound on the chosen setting's loss of success, in points, at 95 % confidence. NaN if no
             setting is chosen.
-        candidate: Fastest setting that is not chosen yet, but would be after more pairs if the rates stay the same.
-            Empty if no setting would be, or if a setting is chosen.
-        candidate_pairs: About how many pairs in all the candidate needs. NaN without a candidate.
+        candidate: If no setting is chosen, the fastest setting that would be chosen after more pairs, if the rates
+            stay the same. Empty if more pairs would not help, or if a setting is chosen.
+        candidate_pairs: About how many pairs in all would let the candidate be chosen. NaN without a candidate.
         tested: Number of settings whose loss of success is tested. A setting is tested if it is faster than the
             baseline or was not timed.
-        episode_speedup: Speed per episode of the chosen setting, or else of the candidate, against the baseline. NaN if
-            it was not timed.
+        episode_speedup: Speed per episode of the chosen setting, or else of the candidate, relative to the baseline.
+            NaN if that setting was not timed.
         runs: Number of runs (commands) from which the interval of `episode_speedup` was computed.
     """
 
@@ -78,7 +78,7 @@ class Choice:
 
 
 def choices(results: Iterable[Result], task_results: Iterable[Result], loss: float) -> list[Choice]:
-    """Return which setting to take for all tasks together, followed by which to take for each task.
+    """Return the choice of a setting for all tasks together, followed by the choice for each task.
 
     Args:
         results: The study's rows over all tasks.
@@ -124,9 +124,9 @@ def choose(where: str, rows: Sequence[Result], loss: float) -> Choice:
 def safest_first(rows: Iterable[Result]) -> list[Result]:
     """Return the rows of the settings to test, the safest first. Success does not influence the order.
 
-    Safe means: few unverified tokens, then many forwards per control step (`safety`). Settings that are equally safe
-    keep the study's order. The baseline, settings without pairs, and settings that were timed and were not faster are
-    left out.
+    A setting is safer if it has fewer unverified tokens, or else more forwards per control step (`safety`). Settings
+    that are equally safe keep the study's order. The baseline and settings without pairs are left out. So are settings
+    that were timed and were not faster than the baseline.
     """
     return sorted((row for row in rows if row.is_compared and not row.speed <= 1), key=safety)
 
@@ -134,8 +134,8 @@ def safest_first(rows: Iterable[Result]) -> list[Result]:
 def _fastest(rows: Sequence[Result]) -> Result:
     """Return the row of the fastest of the tested settings.
 
-    A setting whose interval shows that it is faster than the baseline is preferred to any other. If no setting has a
-    measured speed, return the one that was tested last.
+    A setting whose interval shows that it is faster than the baseline is preferred to any other setting. If no setting
+    has a measured speed, return the setting that was tested last.
     """
 
     def speed(row: Result) -> tuple[bool, float]:
@@ -165,8 +165,8 @@ class Verdict(NamedTuple):
     Attributes:
         sentence: The answer as a sentence for the report.
         is_shown: Whether a setting is shown both to be faster and to lose less success than is accepted.
-        episodes: About how many episodes per task would let the sentence name a setting. 0 if it names one already, or
-            if more episodes would not help.
+        episodes: About how many episodes per task would let the sentence name a setting. 0 if the sentence names a
+            setting already, if more episodes would not help, or if more than 10,000 pairs would be needed.
     """
 
     sentence: str
@@ -237,7 +237,7 @@ def order_of(by_speed: Sequence[tuple[str, stats.Estimate]]) -> str:
     `≈` joins neighbours whose episodes cannot show which is faster. The text explains this sign.
 
     Args:
-        by_speed: The settings, the fastest first, each with its speed against the next slower one.
+        by_speed: The settings, the fastest first, each with its speed relative to the next slower setting.
     """
     text = ""
     for label, speed in by_speed[:-1]:
@@ -247,7 +247,7 @@ def order_of(by_speed: Sequence[tuple[str, stats.Estimate]]) -> str:
 
 
 def unsolved(baseline: str, success: float) -> str:
-    """Return the sentence for a baseline that succeeds too rarely. It says that no setting is recommended.
+    """Return a sentence that no setting is recommended, because the baseline succeeds too rarely.
 
     Args:
         baseline: Label of the baseline.
@@ -287,9 +287,9 @@ def _factor(choice: Choice) -> str:
 
 
 def _missing(choice: Choice) -> str:
-    """Return the clause that says about how many more pairs would show that a setting is good enough to be chosen.
+    """Return a clause on the candidate: about how many more pairs would let the verdict choose that setting.
 
-    The clause names that setting. If more pairs would not help, the clause says so.
+    If there is no candidate, the clause says that more pairs would not help.
     """
     if not choice.candidate:
         return "at these rates, more pairs would not show one either"
@@ -325,7 +325,7 @@ def under_conditions(rows: Sequence[Result]) -> str:
 
 
 def caution(results: Sequence[Result]) -> str:
-    """Return one line that the reader should know before reading the numbers. Empty if there is nothing to say.
+    """Return one line that the reader should know before the numbers. Empty if there is nothing to say.
 
     The line names policies that are given the positions of object and goal, and settings that verify nothing.
     """

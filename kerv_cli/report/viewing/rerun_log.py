@@ -48,7 +48,7 @@ class _Log:
         self.hz = hz
 
     def static(self, path: str, archetype: rr.AsComponents) -> None:
-        """Log data that holds for the whole episode. `path` is the name of the data in the viewer."""
+        """Log data that stays the same for the whole episode. `path` is the name of the data in the viewer."""
         self.recording.log(path, archetype, static=True)
 
     def rows(self, path: str, steps: Steps, columns: Iterable[rr.ComponentColumn]) -> None:
@@ -91,8 +91,8 @@ class _Log:
             path: Name of the plot in the viewer.
             steps: Control step of each row.
             names: Name of each line.
-            values: For each row, one number per line, or the number of the only line. A row that is empty or begins
-                with None is left out.
+            values: For each row, a sequence with one number per line, or a single number if there is only one line. A
+                row that is empty or begins with None is left out.
             colors: Colour of each line (0xRRGGBBAA). The colours repeat if there are more lines than colours.
         """
         present, numbers = [], []

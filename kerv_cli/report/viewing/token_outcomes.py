@@ -22,8 +22,8 @@ class OutcomeStyle(NamedTuple):
     The colours are Okabe and Ito's, for colour-blind readers.
 
     Attributes:
-        symbol: One character.
-        color: 0xRRGGBBAA.
+        symbol: One character that stands for the outcome.
+        color: Colour of the outcome, 0xRRGGBBAA.
         meaning: What the outcome means, for the legend.
     """
 
@@ -67,15 +67,15 @@ class TokenOutcome:
 
 
 def threshold_of(decode: DecodeRecord) -> tuple[int, ...]:
-    """Return the acceptance threshold r of each DoF in a decode, in bins. Empty if the acceptance rule has none."""
+    """Return the acceptance threshold r of each DoF in a decode, in bins. Empty if no round stored a threshold."""
     return next(filter(None, map(attrgetter("threshold"), decode.rounds)), ())
 
 
 def token_names(decodes: Sequence[DecodeRecord], dofs: Sequence[str]) -> Sequence[str]:
-    """Return the names of a control step's tokens: the names `dofs`, or a single name for tokens of a code.
+    """Return the names of a control step's tokens: `dofs`, or the single name `token` if the tokens belong to a code.
 
-    A code encodes whole chunks (docs/methods.md §0.3). Decodes whose number of tokens is no multiple of D come from a
-    code.
+    A code encodes whole chunks, so its tokens have no DoF (docs/methods.md §0.3). Tokens are treated as tokens of a
+    code if some decode without compensation has a number of tokens that is no multiple of D.
     """
     for decode in decodes:
         if not decode.compensated and len(decode.tokens) % len(dofs):
@@ -89,7 +89,7 @@ def _is_coded(decode: DecodeRecord, dofs: int) -> bool:
 
 
 def chunk_size(decodes: Sequence[DecodeRecord], dofs: int) -> int:
-    """Return N, the number of tokens of a chunk, as seen in an episode's decodes.
+    """Find N, the number of tokens of a chunk, from an episode's decodes, and return it.
 
     N is the largest number of tokens that any decode verified, committed or executed. It is rounded up to whole control
     steps.
@@ -154,8 +154,8 @@ def acceptance(decodes: Iterable[DecodeRecord]) -> tuple[float, ...]:
     """Return the acceptance length and the accepted draft tokens per verification (docs/methods.md §7).
 
     Returns:
-        Mean number of committed tokens, and mean number of accepted draft tokens, per verification. Empty if the
-        decodes have no verification.
+        Two numbers per verification: the mean number of committed tokens, and the mean number of accepted draft tokens.
+        Empty if the decodes have no verification.
     """
     rounds = itertools.chain.from_iterable(map(attrgetter("rounds"), decodes))
     verifications = list(filter(attrgetter("is_verification"), rounds))
@@ -205,7 +205,7 @@ def facts_of(record: EpisodeRecord, method: str) -> dict[str, str | float]:
 
 
 def summary(record: EpisodeRecord, method: str) -> str:
-    """Return the episode's totals as Markdown, with a key to the symbols of the tokens."""
+    """Return the episode's totals as Markdown, with a legend of the symbols of the tokens."""
     lines = ["| episode |  |", "|:--|:--|"]
     for name, value in facts_of(record, method).items():
         lines.append(f"| {name.replace('_', ' ')} | {f'{value:.4g}' if isinstance(value, float) else value} |")
@@ -216,7 +216,7 @@ def summary(record: EpisodeRecord, method: str) -> str:
 
 
 def _text(value: object) -> str:
-    """Return a value as text. None is empty."""
+    """Return a value as text. The text is empty if the value is None."""
     return "" if value is None else str(value)
 
 
@@ -228,8 +228,8 @@ def decode_table(
     Args:
         decode: The decode.
         number: Number of the decode in the episode, from 0.
-        step: Control step at which its first action is executed.
-        outcomes: Outcome of each token of its chunk.
+        step: Control step at which the decode's first action is executed.
+        outcomes: Outcome of each token of the decode's chunk.
         names: Names of a control step's tokens, from `token_names`.
     """
     is_coded = _is_coded(decode, len(names))

@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from rerun.chunk import Chunk, RrdReader
 
 MOST_OPENED = 16
-"""Largest number of recordings that one command opens. More would fill the viewer's memory."""
+"""Largest number of recordings that one command opens. More recordings would fill the viewer's memory."""
 NO_RECORDINGS = "no recordings in {}: make some with 'kerv rollout method=ar task=reach-v3'"
 FRAMES_PER_SECOND = 12
-"""Frames per second of a film file. More make it large."""
+"""Frames per second of a film file. A higher number makes the file too large."""
 _START_SECONDS = 2.0
 
 
@@ -78,7 +78,7 @@ def open_recording(paths: Sequence[Path]) -> str:
         paths: The recordings, the newest first. At most MOST_OPENED are opened.
 
     Returns:
-        A sentence about what was opened. Without a display: the commands to type on another machine.
+        A sentence about what was opened. If this machine has no display, the commands to type on another machine.
 
     Raises:
         KervError: A recording is damaged, Rerun is not installed, or the viewer did not start.
@@ -99,7 +99,7 @@ def open_recording(paths: Sequence[Path]) -> str:
 
 
 def _own_name(path: Path) -> str:
-    """Return a file name that no recording of another run has: the run's name, then the recording's name."""
+    """Return a file name that no other run's recording has: the run's name, then the recording's file name."""
     return f"{path.parent.parent.name}-{path.name}" if path.parent.name == "rollouts" else path.name
 
 
@@ -112,7 +112,7 @@ def _start(command: list[str]) -> None:
     """Start the viewer in a process of its own.
 
     Raises:
-        KervError: It cannot be started, or ends within two seconds.
+        KervError: The viewer cannot be started, or ends within two seconds.
     """
     with tempfile.TemporaryFile() as log:
         try:
@@ -208,7 +208,7 @@ def animation(film: Film, slower: float = 1.0) -> bytes:
 
     Args:
         film: The film. It must have frames.
-        slower: How many times slower than the robot moved.
+        slower: How many times slower the film plays than the robot moved. 1 plays in real time.
     """
     hz = film.hz / slower
     each = max(1, round(hz / FRAMES_PER_SECOND))
