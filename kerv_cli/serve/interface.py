@@ -1,9 +1,9 @@
 """Describe what a served policy reads and sends, and check and encode the messages (msgpack with numpy arrays).
 
-An array is a map with the keys __ndarray__ (true), data, dtype and shape. These keys are bytes in openpi and text in
-vla-eval. A single number in openpi is a map with the keys __npgeneric__, data and dtype. An image in vla-eval is a map
-with the keys __image__, data and format. Nothing is unpickled. An array must have exactly the bytes that its shape and
-type need.
+An array is encoded as a map with the keys __ndarray__ (true), data, dtype and shape. These keys are bytes in openpi and
+text in vla-eval. In openpi, a single number is a map with the keys __npgeneric__, data and dtype. In vla-eval, an image
+is a map with the keys __image__, data and format, and with dtype and shape if the format is raw. Nothing is unpickled.
+An array must have exactly the bytes that its shape and type need.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.views import frame_shape
 
 LARGEST = 4096
-"""Most pixels of an image's longest side, for policies that resize images themselves."""
+"""Largest allowed side of an image, in pixels. It limits PNG and JPEG files, and policies that read any image size."""
 OPEN = {"signed": 1.0, "signed_inverted": -1.0}
-"""Number that means an open gripper, by the client's convention. The negative number means closed.
+"""Client's convention (setting `gripper`) -> number that means an open gripper. The negated number means closed.
 
 LIBERO's simulator needs the inverted convention.
 """
@@ -40,7 +40,7 @@ class Interface:
         spec: The policy's environment. None if kerv does not know it.
         gripper: How the gripper's value (0 closed to 1 open) is sent: `as_is`, `signed` (-1 closed, 1 open) or
             `signed_inverted` (1 closed, -1 open).
-        images_alone: Whether the policy reads images of any size and no state. A message may then leave out the state.
+        images_alone: Whether the policy reads images of any size and no state. Then a message may leave out the state.
 
     Attributes:
         actions: Action space of the policy.
@@ -50,7 +50,7 @@ class Interface:
         cameras: Names of the images that the policy reads.
         size: Side of an image in pixels. 0 if the policy reads no images.
         privileged: Whether the policy reads the whole simulator state, not only proprioception.
-        grip: Two values of the gripper in the environment's actions: closing, then opening. Empty if unknown.
+        grip: The two gripper values in the environment's actions: first to close, then to open. Empty if unknown.
     """
 
     description: TargetDescription
@@ -70,9 +70,9 @@ class Interface:
         """Check an image that a client sent, and return it.
 
         Args:
-            image: The image, or a function that returns it. Expected: (height, width, 3) uint8.
-            camera: The camera that it belongs to.
-            key: Its key in the message, for the error message.
+            image: The image, or a function that returns it. It must be (height, width, 3) uint8.
+            camera: The camera that the image belongs to.
+            key: The image's key in the message, for the error message.
 
         Raises:
             UsageError: The image has another shape or type.
@@ -91,12 +91,12 @@ class Interface:
         raise UsageError(f"{key} is {came}, {wanted} uint8 is wanted")
 
     def numbers(self, values: object, key: str, message: Message) -> tuple[np.ndarray, np.ndarray]:
-        """Return proprioception (p,) and privileged state (s,) that a client sent.
+        """Return the proprioception (p,) and the simulator state (s,) that a client sent.
 
-        A message may leave out numbers that the policy does not read. They are then zero.
+        A message may leave out numbers that the policy does not read. These numbers are then zero.
 
         Args:
-            values: What the message holds under `key`. None if it holds nothing.
+            values: What the message holds under `key`. None if the message lacks the key.
             key: Key of the state in the message, for the error message.
             message: The whole message, for the error message.
 
@@ -120,7 +120,7 @@ class Interface:
         return numbers[:few], np.concatenate([numbers, np.zeros(many - len(numbers))])
 
     def converted(self, actions: np.ndarray) -> np.ndarray:
-        """Convert the gripper's values in actions to the client's convention, which the setting `gripper` chooses.
+        """Return actions with the gripper's values in the client's convention, which the setting `gripper` chooses.
 
         Args:
             actions: (H, D), H actions of D DoFs in environment units.
@@ -144,7 +144,7 @@ def text_of(value: object, key: str) -> str:
 
     Args:
         value: The value to check.
-        key: Its key in the message, for the error message.
+        key: The value's key in the message, for the error message.
 
     Raises:
         UsageError: The value is not a text.
@@ -170,7 +170,7 @@ def packed(value: object, text_keys: bool = False) -> bytes:
 
     Args:
         value: Dictionaries, lists, texts, numbers and arrays.
-        text_keys: Whether the keys of an array's map are texts, as vla-eval wants, or bytes, as openpi wants.
+        text_keys: If true, the keys of an array's map are texts, as in vla-eval. If false, bytes, as in openpi.
     """
     import msgpack
 
@@ -187,10 +187,10 @@ def packed(value: object, text_keys: bool = False) -> bytes:
 
 
 def unpacked(frame: bytes | str) -> Message:
-    """Decode a client's message with msgpack. Images in it become functions that return the image.
+    """Decode a client's message with msgpack. A PNG or JPEG image becomes a function that returns the decoded image.
 
     Raises:
-        UsageError: The message is not a msgpack map with text keys, or an array in it does not fit its bytes.
+        UsageError: The message is not a msgpack map with text keys, or the bytes of an array do not fit its shape.
     """
     import msgpack
 
@@ -210,7 +210,8 @@ def unpacked(frame: bytes | str) -> Message:
 def _value(value: dict[Any, Any]) -> object:
     """Decode a map inside a message, if it encodes an array, a number or an image. Return any other map unchanged.
 
-    An image becomes a function that decodes it when called, because most images are never used.
+    A PNG or JPEG image becomes a function that decodes the image when called, because most images are never used. A raw
+    image becomes an array.
     """
     items = {key.decode() if isinstance(key, bytes) else key: item for key, item in value.items()}
     data, name = items.get("data"), items.get("dtype")
@@ -224,10 +225,10 @@ def _value(value: dict[Any, Any]) -> object:
 
 
 def _array(name: object, shape: Any, data: Any) -> np.ndarray:
-    """Build an array from the parts in which a message encodes it.
+    """Build an array from its dtype, shape and bytes, as a message encodes them.
 
     Args:
-        name: Name of the dtype: a bool, integer or float type.
+        name: Name of the dtype, which must be a bool, integer or float type.
         shape: List of integers.
         data: The array's bytes.
 
@@ -258,7 +259,7 @@ def _dtype(name: object) -> np.dtype:
 
 
 def _image(data: Any) -> np.ndarray:
-    """Decode a PNG or JPEG file to an image (height, width, 3).
+    """Decode a PNG or JPEG file to an array, which is (height, width, 3) for a colour image.
 
     Raises:
         UsageError: The file is neither PNG nor JPEG, is damaged, or its image is too large.

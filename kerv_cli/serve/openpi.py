@@ -52,7 +52,7 @@ class OpenPi(Conversation):
     """Serve one robot at a time. A robot that sends nothing for two minutes is disconnected.
 
     Attributes:
-        last: (H, D) the H actions of the latest answer, for D DoFs, in environment units.
+        last: (H, D) actions of the latest answer, for H control steps and D DoFs, in environment units.
         last_hand: (3,) position of the end effector when that answer was computed, in metres.
         decodes: Number of answers so far.
         tally: How many draft tokens were accepted in all answers so far.
@@ -67,7 +67,7 @@ class OpenPi(Conversation):
         self.tally = Tally.of_records((), self.interface.actions.kinds)
 
     def greeting(self) -> bytes:
-        """Return the first message to the client: what it must know about the policy, as `metadata` describes it."""
+        """Return the first message to the client: the encoded `metadata` of the policy."""
         return packed(metadata(self.policy))
 
     def answer(self, frame: bytes | str) -> bytes:
@@ -85,8 +85,8 @@ class OpenPi(Conversation):
         """Return the values of the answer to a client's message: actions, times, forwards and acceptance.
 
         Args:
-            message: The observation. It may also have `executed`, how many of the last actions were executed, and
-                `reset`, which begins a new episode.
+            message: The observation. It may also have the key `executed` (how many actions of the latest answer were
+                executed) and the key `reset` (true begins a new episode).
 
         Raises:
             UsageError: A value is missing or wrong.
@@ -121,10 +121,11 @@ class OpenPi(Conversation):
     def _executed(self, message: Message) -> np.ndarray:
         """Return the actions that the robot has executed since the latest answer.
 
-        These are the first `executed` actions of that answer, or all its actions if the message has no `executed`.
+        These are the first `executed` actions of the latest answer. Without the key `executed` in the message, these
+        are all actions of that answer.
 
         Raises:
-            UsageError: `executed` is not a number from 0 to the number of actions of that answer.
+            UsageError: `executed` is not a whole number from 0 to the number of actions of the latest answer.
         """
         count = message.get(EXECUTED, len(self.last))
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 0 <= count <= len(self.last):

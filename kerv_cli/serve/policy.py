@@ -33,7 +33,7 @@ from kerv_cli.worlds import specs
 VLA_EVAL = "vla_eval"
 """The protocol in which clients name the task of every episode."""
 WARM_UP = 4
-"""Number of decodes before a new decoder serves. The first calls are slow: they allocate memory and choose kernels."""
+"""Number of decodes before a new decoder serves. First decodes are slow: they allocate memory and choose kernels."""
 LEAST_WIDTH = 1.0
 """Width assumed for the range of a number that hardly varied in the demonstrations, in the number's own unit."""
 
@@ -41,15 +41,16 @@ LEAST_WIDTH = 1.0
 class Policy:
     """The policy and method that the server runs.
 
-    Every client gets its own decoder. All decoders share the weights. Only one decodes at a time.
+    Every client gets its own decoder. All decoders share the weights. Only one decoder decodes at a time.
 
     Attributes:
         chunk: H, number of control steps in an answer.
-        by_task: Whether a decoder depends on the task, because the method's calibrated values or drafts do. Clients
-            then name the task.
-        low: (p,) smallest states on which the policy may act: the range of its demonstrations plus a margin. Empty if
-            the checkpoint stores no range, or if the policy reads no state.
-        high: (p,) largest states on which the policy may act.
+        by_task: Whether a decoder depends on the task, because the method's calibrated values or drafts do. If so,
+            clients must name the task.
+        low: (p,) lower ends of the ranges in which the policy may act, one per number of the state: the range of the
+            demonstrations plus a margin. (s,) if the policy reads the whole simulator state. Empty if the checkpoint
+            stores no range, or if the policy reads no state.
+        high: Upper ends of these ranges, of the same shape.
 
     Raises:
         UnknownName: The policy's environment has no task with that name.
@@ -92,7 +93,7 @@ class Policy:
         self.take_back(first)
 
     def lend_decoder(self, task: str) -> Decoder:
-        """Return a decoder for a new client. A new decoder is warmed up."""
+        """Return a decoder for a new client: one that another client gave back, or a new one, warmed up."""
         with contextlib.suppress(IndexError):  # two clients may connect at once
             return self._idle.pop()
         with self._turn:
@@ -107,10 +108,10 @@ class Policy:
             self._idle.append(decoder)
 
     def check_range(self, observation: Observation) -> None:
-        """Check that the policy may act on a state.
+        """Check that the state in an observation is in the range in which the policy may act.
 
         Raises:
-            UsageError: A number of the state is out of range. The message names the first one.
+            UsageError: A number of the state is out of range. The message names the first such number.
         """
         numbers, names = observation.state[: len(self.low)], self.interface.observation.proprioception
         for first in np.flatnonzero((numbers < self.low) | (numbers > self.high)).tolist():
@@ -124,7 +125,7 @@ class Policy:
         """Decode the observation of one client. Calls from several threads wait for each other.
 
         Args:
-            decoder: What `lend_decoder` returned for this client.
+            decoder: The decoder that `lend_decoder` returned for this client.
             observation: The client's observation.
 
         Raises:
@@ -147,7 +148,7 @@ class Policy:
 
 
 class Finite:
-    """A wrapper of a target that also checks whether its prompts and logits are finite."""
+    """Wraps a target, and checks whether all numbers in the target's prompts and logits are finite."""
 
     def __init__(self, target: Target) -> None:
         self._target = target
@@ -157,20 +158,24 @@ class Finite:
         return getattr(self._target, name)
 
     def encode(self, observation: Observation) -> Tensor:
-        """Return the prompt. `check` will raise an error if a number in it is not finite."""
+        """Return the target's prompt. The next call of `check` raises an error if a number in it is not finite."""
         return self._noted(self._target.encode(observation))
 
     def head(self, hidden: Tensor) -> Tensor:
-        """Return the logits. `check` will raise an error if one of them is not finite."""
+        """Return the target's logits. The next call of `check` raises an error if a logit is not finite."""
         return self._noted(self._target.head(hidden))
 
     def _noted(self, numbers: Tensor) -> Tensor:
-        """Start to check numbers without waiting for the device, and return them. `check` reads the result."""
+        """Start to check whether numbers are finite, without waiting for the device. Return the numbers unchanged."""
         self._fine.append(torch.isfinite(numbers).all())
         return numbers
 
     def check(self) -> None:
-        """Raise KervError if any prompt or logits since the last call held NaN or infinite numbers."""
+        """Check all prompts and logits since the last call.
+
+        Raises:
+            KervError: A number is NaN or infinite.
+        """
         fine, self._fine = self._fine, []
         if fine and not bool(torch.stack(fine).all()):
             raise KervError("the policy computed numbers that are not finite: no action is sent")
@@ -181,11 +186,12 @@ class Conversation(abc.ABC):
 
     Attributes:
         seats: Largest number of clients at a time.
-        ping_s: A client that does not answer a ping for this many seconds is disconnected. None: send no pings.
+        ping_s: A client that does not answer a ping for this many seconds is disconnected. If None, no pings are sent.
         idle_s: A client that sends no message for this many seconds is disconnected.
         task: Task of the current episode. Empty if unknown.
-        decoder: The client's decoder. If it depends on the task, None before the first episode.
-        last_ms: Milliseconds from the arrival of the last message until its answer was sent. NaN before the first.
+        decoder: The client's decoder. None before the first episode if decoders depend on the task.
+        last_ms: Milliseconds from the arrival of the last message until its answer was sent. NaN before the first
+            answer.
     """
 
     seats: int

@@ -34,11 +34,11 @@ HEALTH = ("/healthz", "/health")
 BUSY, GONE = 1013, 1001
 """Websocket close codes: 1013 means "try again later", 1001 "going away"."""
 LARGEST_MESSAGE = 16 * 2**20
-"""Most bytes of a client's message."""
+"""Largest size of a client's message, in bytes."""
 LONGEST = 500
-"""Most characters of an error message. Texts that a client sent may be longer and are cut."""
+"""Largest length of an error message, in characters. An error message may quote long texts, so it is cut."""
 PATIENCE = 1.0
-"""Seconds for which a new client waits until another one leaves. Its own last connection may just be closing."""
+"""Seconds for which a new client waits until another client leaves. Its own old connection may still be closing."""
 FAREWELL = 2.0
 """Seconds for which the server waits for one client to close its connection."""
 LAST_ANSWERS = 0.5
@@ -62,9 +62,9 @@ class PolicyServer:
 
     @contextlib.contextmanager
     def listening(self, host: str, port: int) -> Iterator[int]:
-        """Serve clients until the end of the block. Yield the port.
+        """Serve clients until the end of the `with` block. Yield the port.
 
-        All threads are daemons. No client can delay the end by more than LAST_ANSWERS seconds, even during its
+        All threads are daemons. No client can delay the end by more than LAST_ANSWERS seconds, even during the client's
         handshake.
 
         Args:
@@ -131,7 +131,7 @@ class PolicyServer:
             self.log(f"{who} disconnected{why}; {_summary(times)}")
 
     def _talk(self, connection: ServerConnection, who: str, times: list[float]) -> None:
-        """Answer messages until the connection ends. A message that cannot be answered gets one that says why.
+        """Answer messages until the connection ends. If a message is wrong, the answer says what is wrong.
 
         Args:
             connection: The connection.
@@ -162,12 +162,12 @@ class PolicyServer:
 
 
 def _start(function: Callable[..., object], *arguments: object) -> None:
-    """Call a function in a new daemon thread. Threads that it starts are daemons, too."""
+    """Call a function in a new daemon thread. Threads that the function starts are daemons, too."""
     threading.Thread(target=function, args=arguments, daemon=True).start()
 
 
 def _summary(times: list[float]) -> str:
-    """Return the number of answers and how long they took, as text for the log. `times` are in milliseconds."""
+    """Return the number of answers and their times as text for the log. `times` are in milliseconds."""
     if not times:
         return "0 answers"
     p50, p95 = np.percentile(times, [50, 95])
@@ -195,5 +195,5 @@ def _one_line_logger(log: Callable[[str], None]) -> logging.Logger:
 
 
 def _health(connection: ServerConnection, request: Request) -> Response | None:
-    """Answer an HTTP request to /healthz or /health. Return None for all others, which are websocket connections."""
+    """Answer an HTTP request to /healthz or /health. Return None for any other request: it opens a websocket."""
     return connection.respond(http.HTTPStatus.OK, "OK\n") if request.path in HEALTH else None

@@ -1,8 +1,8 @@
 """Speak vla-eval's protocol, version 1: a benchmark asks for one action at every control step.
 
-A message is a msgpack map of type, payload, seq and timestamp. The server answers `hello` with what the policy reads
-and sends. It answers every observation with one action. A new chunk is decoded when the last one is used up. The
-package vla-eval is not needed here.
+A message is a msgpack map with the keys type, payload, seq and timestamp. The server answers a message of type `hello`
+with a description of what the policy reads and sends. It answers every observation with one action. A new chunk is
+decoded when all actions of the last chunk have been sent. The package vla-eval is not needed here.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from kerv_cli.serve.policy import Conversation, Policy
 
 PROTOCOL_VERSION = 1
 MOST_STEPS = 20_000
-"""Most control steps of an episode. The episode's record grows with every step until the client ends the episode."""
+"""Largest number of control steps of an episode. It limits the episode's record, which grows with every step."""
 _FORMATS = {("position", 3): "delta_xyz", ("rotation", 3): "axis_angle"}
-"""The name that vla-eval gives to a group of DoFs, by the group's name and size."""
+"""(Name of a group of DoFs, number of DoFs) -> vla-eval's name for the format of the group's values."""
 
 
 def dim_specs(interface: Interface) -> dict[str, dict[str, dict[str, object]]]:
@@ -62,7 +62,7 @@ def _gripper_format(interface: Interface) -> str:
 def observation_params(interface: Interface) -> dict[str, object]:
     """Return the arguments that a benchmark should pass to the policy's own environment.
 
-    The benchmark's YAML file overrides them. Empty if the environment is unknown or needs no arguments.
+    The benchmark's YAML file overrides these arguments. Empty if the environment is unknown or needs no arguments.
     """
     if not interface.grip or interface.images_alone:
         return {}
@@ -119,7 +119,7 @@ class VlaEval(Conversation):
         return self._message("error", {"error": line})
 
     def _message(self, kind: str, payload: Mapping[str, object]) -> bytes:
-        """Encode a message of a type (`kind`) with its content."""
+        """Encode a message to the client: its type is `kind`, its content is `payload`."""
         message = {"type": kind, "payload": payload, "seq": self.sequence, "timestamp": time.time()}
         return packed(message, text_keys=True)
 
@@ -143,15 +143,15 @@ class VlaEval(Conversation):
     def _start(self, payload: Message) -> None:
         """Note that a new episode begins.
 
-        The decoder is built at the first observation. Errors in `payload` are reported only then.
+        A decoder for the episode's task is built at the first observation. Only then are errors in `payload` reported.
         """
         self.episode = _Episode(payload)
 
     def _observe(self, payload: Message) -> bytes:
-        """Return the next action. If the last chunk is used up, decode this observation first.
+        """Return the next action. If all actions of the last chunk have been sent, decode this observation first.
 
         Raises:
-            UsageError: Something is wrong with the observation, or the episode has MOST_STEPS control steps.
+            UsageError: Something is wrong with the observation, or the episode already has MOST_STEPS control steps.
         """
         episode = self.episode = self.episode or _Episode({})
         if len(episode.sent) >= MOST_STEPS:
@@ -182,7 +182,7 @@ class VlaEval(Conversation):
         Args:
             episode: The current episode, whose instruction is updated.
             payload: Content of the message.
-            numbers: Proprioception and state, already checked.
+            numbers: Proprioception (p,) and simulator state (s,), already checked.
 
         Raises:
             UsageError: An image is missing or has a wrong size or type.
