@@ -1,6 +1,6 @@
 """The calibration: numbers measured on training demonstrations (docs/methods.md §3, §4).
 
-`kerv calibrate` writes it. Thresholds, predictors, boundaries and the rule that skips verification read it.
+`kerv calibrate` writes the calibration. Thresholds, predictors, boundaries and skip rules read it.
 """
 
 from __future__ import annotations
@@ -218,9 +218,9 @@ class CalibrationArtifact(Artifact[Calibration]):
     schema = Calibration
 
     def path(self, results: str, name: str | None, target: Path) -> Path:
-        """Return the path of the calibration with this name. Without a name, take the one beside the target.
+        """Return the path of the calibration with this name. Without a name, the calibration is beside the target.
 
-        A shipped calibration is `pretrained/<name>/calibration.json`. One made by `kerv calibrate` is
+        A shipped calibration is `pretrained/<name>/calibration.json`. A calibration that `kerv calibrate` made is
         `artifacts/calibration/<name>/calibration.json`.
         """
         if name is None and target.name == "target":

@@ -32,7 +32,7 @@ class JacobiProposerSettings:
 class JacobiProposer(ChainProposer):
     """Guesses the remaining tokens of a chunk. After each forward, the target's tokens become the next guess.
 
-    With strict acceptance this ends with the tokens of autoregressive decoding. If a prefill draft was rejected, the
+    With strict acceptance the result equals the tokens of autoregressive decoding. If a prefill draft was rejected, the
     first guess begins with the target's tokens after the rejection. All other tokens of the first guess are the end
     token, or the middle token (normalised action 0) if chunks have no end token.
 

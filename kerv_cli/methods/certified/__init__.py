@@ -82,7 +82,10 @@ def needs_outside(settings: ScopedSettings) -> tuple[str, ...]:
 
 @ProposerPart("scoped", ScopedSettings, needs=needs_outside, when=PREFILL, chains=True)
 def scoped(settings: ScopedSettings, context: Context) -> Proposer:
-    """Build the proposer for the decoder's task: the certified one if the certificate covers it, else `outside`."""
+    """Build the proposer for the decoder's task.
+
+    It is the certified proposer if the certificate covers the task and certifies a candidate, else `outside`.
+    """
     certificate = covering(context)
     if certificate is not None and certificate.certified is not None:
         source = certificate.certified.source
@@ -97,7 +100,7 @@ def certified(settings: CertifiedSkipSettings, context: Context) -> Skip | None:
     """Build the certified rule on the certificate's tasks, and a streak on other tasks.
 
     Returns:
-        The skip rule. None if the certificate covers the task but no rule was certified: then every draft is verified.
+        The skip rule. None if the certificate covers the task but certifies no rule. Then every draft is verified.
 
     Raises:
         UsageError: The method, the number format or the chunk length is not the certified one.

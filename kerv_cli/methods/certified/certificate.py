@@ -54,7 +54,7 @@ class Candidate:
 
     @property
     def source(self) -> Any:
-        """Settings of the proposer that drafts before the prefill. The skip rule executes its drafts."""
+        """Settings of the proposer that drafts before the prefill. The skip rule executes this proposer's drafts."""
         return _part_settings("prefill_draft", self.draft)
 
 
@@ -98,7 +98,7 @@ class Attempt:
 
 @dataclass(frozen=True)
 class Certificate:
-    """A certificate: on `tasks`, the chosen candidate loses at most `margin` points of AR's success.
+    """A certificate states that on `tasks` the chosen candidate loses at most `margin` points of AR's success.
 
     Attributes:
         target: Hash of the target's weights.
@@ -170,7 +170,7 @@ class Certificate:
 
     @property
     def certified(self) -> Candidate | None:
-        """The boldest certified candidate; None if no candidate was certified."""
+        """The boldest certified candidate. None if no candidate was certified."""
         return None if self.chosen is None else self.candidates[self.chosen]
 
     def check_method(self, method: Mapping[str, Any], dtype: str) -> None:

@@ -143,10 +143,10 @@ class EarlyNetwork(Compilable):
 def choose(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tensor, Tensor]:
     """Choose the tokens that are most likely to be accepted, and estimate the probability that all are accepted.
 
-    A token is accepted if the target's token is at most `radius` bins away. So the best bin is the one with the most
-    probability in this range around it. It need not be the most probable bin. If several bins are about equally good,
-    the bin with more probability close to it wins, because it is likely nearer to the target's token. For a strict
-    token the most probable bin is chosen.
+    A token is accepted if the target's token is at most `radius` bins away. So the best bin is the bin with the most
+    probability in this range around it. The best bin need not be the most probable bin. If several bins are about
+    equally good, the bin with more probability close to it wins, because it is likely nearer to the target's token. For
+    a strict token the most probable bin is chosen.
 
     The estimate treats tokens as independent, and training on soft labels makes the estimate too low. Use it only to
     compare chunks.
@@ -171,7 +171,7 @@ def choose(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tensor, Tensor]
 
 
 def _between(below: Tensor, pad: int, radius: int, bins: int) -> Tensor:
-    """Return, for each bin, the summed probability of the bins within ±radius of it.
+    """Return, for each bin, the summed probability of the bins that are at most `radius` bins away.
 
     Args:
         below: (…, V + 2 pad + 1) cumulative probability over the bins, padded on both sides.
@@ -255,7 +255,7 @@ class EarlyDrafter(TrainableDrafter):
 
     @classmethod
     def proposer(cls, settings: NoSettings, context: Context) -> EarlyProposer:
-        """Build the part that the setting `proposer=early` or `proposer=scout` chooses."""
+        """Build the proposer that drafts with the policy's early drafter, or with its scout."""
         return cls.drafts_with(context.artifact(cls.kind), context.target)
 
     def decoded(
@@ -330,7 +330,7 @@ def measure(logits: Tensor, examples: Decodes, strict: Tensor, end: int | None =
         logits: (n, N, V) of the drafter.
         examples: The target's greedy decodes of the same n observations.
         strict: (N,) bool, tokens that must equal the target's.
-        end: The token that ends a chunk. Tokens after it are not counted. None: chunks have no such token.
+        end: The token that ends a chunk. Tokens after it are not counted. None if chunks have no such token.
 
     Returns:
         For each radius the mean number of accepted tokens, and the share of drafts of which all tokens are accepted.

@@ -68,7 +68,7 @@ class Index(ABC):
             key: (d,) float32, the key to compare with.
             task: Full name of the task.
             k: Number of rows wanted.
-            without: Seed of an episode to leave out. None: use all episodes.
+            without: Seed of an episode to leave out. If None, use all episodes.
         """
 
 
@@ -442,7 +442,7 @@ class VerifySkip(Skip):
     def build(cls, settings: SimilaritySkipSettings, context: Context) -> VerifySkip:
         """Build the part that the setting `skip=similarity` chooses.
 
-        If the method's proposer also retrieves, the datastore is searched only once for both.
+        If the method's proposer also retrieves, the skip rule uses that proposer's search instead of a second search.
         """
         proposer: Proposer | None = context.built["proposer"]
         retrieval = proposer.proposers["retrieval"] if isinstance(proposer, HybridProposer) else proposer
@@ -459,7 +459,7 @@ class VerifySkip(Skip):
         self.ended.clear()
 
     def finish(self, success: bool) -> None:
-        """End an episode: raise s_min, the similarity needed to skip, after a failure; lower it after a success."""
+        """End an episode. Raise s_min after a failure (setting `up`), and lower s_min after a success (`down`)."""
         span = self.high - self.low
         s_min = self.s_min + span * (-self.settings.down if success else self.settings.up)
         self.s_min = min(self.high, max(self.low, s_min))

@@ -4,7 +4,7 @@ Each entry has a key and a chunk. The key is the observation as the target encod
 prompt, the mean token is L2-normalised. These vectors are concatenated, and the result is normalised again. Optionally,
 keys are projected onto their leading directions. By default the key is made of the segment `scene` alone, which encodes
 hand, object and goal. On MT10 this key finds the most similar chunks of other episodes. A key with vision tokens finds
-less similar ones. The chunk is the expert's next H actions, as tokens.
+less similar chunks. An entry's chunk is the expert's next H actions, as tokens.
 
 A datastore is a folder with `vectors.npy` (rows, d) float32 or float16, `payload.parquet`, `manifest.json` and, if keys
 are projected, `projection.npy`. Rows are sorted by task, seed and step.

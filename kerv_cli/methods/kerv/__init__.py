@@ -204,7 +204,7 @@ class KinematicThresholdSettings(RadiusRange):
     """KERV: the acceptance radius r follows the variability K, the distance of the last drafts to the target's tokens.
 
     KERV's authors leave open how Δr = (r_max − r_min) · exp(−(ΔK / K_S)^φ) changes r (docs/methods.md §3.2). Each
-    reading is one kind of threshold:
+    interpretation is one kind of threshold:
 
     - `offset`: r = r_min + Δr, as KERV's README says. r shrinks when K changes.
     - `quoted`: r ← r + Δr, as the formula is printed. r never shrinks.
@@ -267,7 +267,7 @@ class Variable(Threshold):
 
     Attributes:
         r: The radius of the next decode, in bins, not rounded.
-        measure: How K is computed.
+        measure: Way to compute K.
         last: K of the last decode in which drafts were compared.
     """
 
@@ -327,7 +327,7 @@ class Schedule(Threshold):
     """The acceptance radius falls with the number t of decodes in the episode. The motion is not used.
 
     r(t) = r_min + (r_max − r_min) · exp(−(t / τ)^φ). The default settings are those of KERV's public code:
-    3 + 12 · exp(−(t / τ)^3).
+    r(t) = 3 + 12 · exp(−(t / 20)³).
     """
 
     def __init__(self, settings: ScheduleThresholdSettings, context: Context) -> None:

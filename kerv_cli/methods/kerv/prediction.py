@@ -220,8 +220,8 @@ class Walk(Predictor):
     """The filter of KERV's public code: a random walk per DoF, on token ids, with Q = 1 and R = 1e-3.
 
     It is a Kalman filter whose state is the action alone. Its gain is 0.999, so it nearly repeats the last action. The
-    first action is its first state, with the variance R. A token id is a normalised value times a scale plus an offset.
-    So the filter has the same weights for token ids and for normalised values.
+    filter starts at the first action, with the variance R. A token id is a normalised value times a scale plus an
+    offset. So the filter has the same weights for token ids and for normalised values.
     """
 
     name = "walk"
@@ -301,7 +301,7 @@ def assemble(
         chunk: The chunk.
         predictor: Predicts the actions that are still missing.
         settings: Settings of the compensation.
-        drafted: Tokens of the rejected draft that follow `tokens`. Empty: use predictions only.
+        drafted: Tokens of the rejected draft that follow `tokens`. If empty, only predictions fill the gap.
 
     Returns:
         (S, D) normalised actions of the chunk's first S control steps, known and filled ones. None if there are too few
