@@ -65,8 +65,8 @@ class StudyData:
             measured all episodes of the study, or else all settings and tasks on its own seeds. Empty if there are
             fewer than three such runs.
         same_pairs: Whether each run measured all episodes of the study.
-        against: Suffix of the tables' names, such as `_against_ar`, if the user chose another baseline than the study's
-            own baseline. Otherwise empty.
+        against: Suffix of the names of tables and page, such as `_against_ar`, if the user chose another baseline than
+            the study's own baseline. Otherwise empty.
     """
 
     study: Study
