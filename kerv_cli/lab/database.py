@@ -13,6 +13,7 @@ import re
 import sqlite3
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -509,7 +510,7 @@ def measures_in(connection: sa.Connection) -> list[sa.ColumnElement[Any]]:
 
     If an older kerv made the table, columns may be missing. A missing column reads as null in every row.
     """
-    stored = {column["name"] for column in sa.inspect(connection).get_columns(EPISODES.name)}
+    stored = set(map(itemgetter("name"), sa.inspect(connection).get_columns(EPISODES.name)))
     return [EPISODES.c[one.name] if one.name in stored else sa.null().label(one.name) for one in MEASURES]
 
 

@@ -132,12 +132,12 @@ class Block:
     @property
     def keys(self) -> list[Key]:
         """Key of each episode."""
-        return [one.key for one in self.episodes]
+        return list(map(attrgetter("key"), self.episodes))
 
     @property
     def seeds(self) -> list[int]:
         """The block's seeds, each once, ascending."""
-        return sorted({one.seed for one in self.episodes})
+        return sorted(set(map(attrgetter("seed"), self.episodes)))
 
     @property
     def batch(self) -> int:
@@ -211,7 +211,8 @@ def split(
     existing: dict[Episode, StoredEpisode] = {}
     for turn in _turns(episodes).values():
         found = _rows_of_turn(turn, usable)
-        if rerun != TIMED or (len(found) == len(turn) and len({row.block for row in found.values()}) == 1):
+        is_one_block = len(found) == len(turn) and len(set(map(attrgetter("block"), found.values()))) == 1
+        if rerun != TIMED or is_one_block:
             existing |= found
     for part in _ordered_parts(episodes, block):
         if not existing.keys() >= set(part):

@@ -58,8 +58,10 @@ class NamedProfile:
         floor, system = about.get("encoder_floor"), float(about.get("encoder_system", 0.0))
         if not isinstance(floor, int | float):
             return {}
-        costs = zip(ENCODERS, (floor + system, 2 * floor + system, _EIGHT_MS + system), strict=True)
-        return {name: replace(self.profile, phases={**phases, "encode": ((1,), (cost,))}) for name, cost in costs}
+        profiles = {}
+        for name, cost in zip(ENCODERS, (floor, 2 * floor, _EIGHT_MS), strict=True):
+            profiles[name] = replace(self.profile, phases={**phases, "encode": ((1,), (cost + system,))})
+        return profiles
 
     def check(self, tokens: int, kinds: Iterable[str] = (), setting: str = "") -> None:
         """Refuse a profile that lacks costs.

@@ -76,8 +76,8 @@ class Tally:
         return cls.of(start.to_numpy(), judged, accepted.to_numpy(), nodes.to_numpy(), dofs)
 
     def __add__(self, other: Tally) -> Tally:
-        names = ("lengths", "judged", "reached", "accepted")
-        return Tally(self.nodes + other.nodes, *(_sum(getattr(self, name), getattr(other, name)) for name in names))
+        counts = attrgetter("lengths", "judged", "reached", "accepted")
+        return Tally(self.nodes + other.nodes, *map(_sum, counts(self), counts(other)))
 
     @property
     def drafts(self) -> int:

@@ -213,7 +213,9 @@ def _value(value: dict[Any, Any]) -> object:
     A PNG or JPEG image becomes a function that decodes the image when called, because most images are never used. A raw
     image becomes an array.
     """
-    items = {key.decode() if isinstance(key, bytes) else key: item for key, item in value.items()}
+    items = {}
+    for key, item in value.items():
+        items[key.decode() if isinstance(key, bytes) else key] = item
     data, name = items.get("data"), items.get("dtype")
     if items.get("__image__") and items.get("format") != "raw":
         return functools.partial(_image, data)
