@@ -1,4 +1,4 @@
-"""Codes of whole chunks: sequences of tokens that stand for all actions of a chunk together (docs/methods.md §0.3).
+"""FAST tokens: a sequence of tokens encodes all actions of a chunk together (docs/methods.md §0.3).
 
 Notation: D degrees of freedom (DoFs) of an action, H control steps of a chunk, V different tokens.
 """
@@ -159,5 +159,5 @@ class FastCode:
 
 
 CODES: dict[str, Callable[[np.ndarray], FastCode | None]] = {"bins": lambda chunks: None, "fast": FastCode.learn}
-"""For each name of a code, the function that learns the code from chunks (n, H, D) of normalised actions. The function
+"""For each kind of tokens, the function that learns its code from chunks (n, H, D) of normalised actions. The function
 of `bins` returns None, because every number of an action is then a token of its own."""

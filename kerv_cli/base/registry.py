@@ -164,7 +164,7 @@ class Part:
 
         Args:
             group: Name of the setting that chooses the part, for the error message.
-            coded: Whether the target's tokens are a code of whole chunks.
+            coded: Whether the target has FAST tokens, which encode whole chunks.
 
         Raises:
             UsageError: The part needs a distance.
@@ -206,8 +206,8 @@ class ProposerPart(Part):
         merged: Whether it merges chains of several proposers.
         has_boundary: Whether a boundary chooses between retrieval and a drafter.
         looks_up: Whether it searches a datastore.
-        cost: Kind of cost under which a latency profile gives the seconds of a draft. Empty if no kind does.
-        measured_by: Name of the method whose decodes measure this cost. Empty if no method does.
+        cost: Kind of cost under which a latency profile gives the seconds of a draft. Empty if there is none.
+        measured_by: Name of the method whose decodes measure this cost. Empty if there is none.
     """
 
     kind = "proposer"
@@ -329,7 +329,7 @@ class ArtifactPart(Part):
         needs_task: Whether it can be used only for tasks that it contains.
         names_more: Whether its description names further artifacts that it needs.
         described_by: Name of the file that describes the artifact. If empty, it is `<kind>.json`.
-        study: Name of the study that makes the artifact. Empty if no study does.
+        study: Name of the study that makes the artifact. Empty if no study makes it.
     """
 
     kind = "artifact"

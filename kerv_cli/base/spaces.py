@@ -4,8 +4,8 @@ An environment has an `ActionSpace` and an `ObservationSpace`. Every artifact th
 drafter, datastore, calibration. Artifacts with different action spaces cannot be used together (`check_same`).
 
 Notation (docs/methods.md §0): D degrees of freedom (DoFs) per control step, H control steps per chunk, N = H · D
-tokens; token j belongs to control step j // D and DoF j % D. With a code of whole chunks, N is the largest number of
-tokens, and a token belongs to no single step or DoF.
+tokens; token j belongs to control step j // D and DoF j % D. With FAST tokens, which encode whole chunks, N is the
+largest number of tokens, and a token belongs to no single step or DoF.
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ class ActionSpace:
         bins: Number of edges on [-1, 1]. A token is the index of one of the bins - 1 intervals (OpenVLA: 256 edges).
         end_token: Whether there is one more token for the value 1. It decodes to the centre of the last interval.
             Published OpenVLA checkpoints were trained with it.
-        code: A code of whole chunks. None if each number of an action is a token of its own, the index of its bin.
+        code: The code of FAST tokens, which encode whole chunks. None if each number of an action is a token of its
+            own, the index of its bin.
 
     Raises:
         ValueError: The fields contradict each other.
@@ -101,12 +102,12 @@ class ActionSpace:
 
     @property
     def kinds(self) -> int:
-        """Number of kinds of tokens: D, one kind per DoF. With a code of whole chunks, all tokens are of one kind."""
+        """Number of kinds of tokens: D, one kind per DoF. All FAST tokens are of the same kind."""
         return 1 if self.code else self.dofs
 
     @property
     def end(self) -> int | None:
-        """The token that ends a chunk. None without a code of whole chunks, because all chunks then have N tokens."""
+        """The FAST token that ends a chunk. None for other tokens, because then every chunk has N tokens."""
         return self.code.end if self.code else None
 
     @cached_property
@@ -168,8 +169,8 @@ class ActionSpace:
             stop: Index after the last token. A group that is only partly inside is cut.
 
         Yields:
-            For each group: index of its first token, index after its last token, whether all its DoFs are strict. With
-            a code of whole chunks, every token is a group that is not strict.
+            For each group: index of its first token, index after its last token, whether all its DoFs are strict.
+            Every FAST token is a group of its own that is not strict.
         """
         if self.code is not None:  # no token belongs to one DoF
             for token in range(start, stop):
@@ -185,7 +186,7 @@ class ActionSpace:
     def strict_tokens(self, size: int) -> np.ndarray:
         """Return which of a chunk's first `size` tokens belong to strict DoFs, (size,) bool.
 
-        With a code of whole chunks, all tokens count as strict.
+        All FAST tokens count as strict.
         """
         return np.resize(self.is_strict, size) if self.code is None else np.ones(size, dtype=bool)
 
@@ -220,7 +221,10 @@ class ActionSpace:
         return self.code.longest if self.code else steps * self.dofs
 
     def chunk_tokens(self, chunks: np.ndarray) -> np.ndarray:
-        """Return the tokens (n, N) int64 of chunks (n, H, D) in environment units. End tokens fill shorter chunks."""
+        """Return the tokens (n, N) int64 of chunks (n, H, D) in environment units.
+
+        With FAST tokens, a chunk may have fewer than N tokens. Its row is then filled up with end tokens.
+        """
         if self.code is None:
             return self.encode(chunks).reshape(len(chunks), -1)
         return self.code.encode(self.code.coefficients(self.normalise(chunks)))
@@ -228,7 +232,7 @@ class ActionSpace:
     def chunk_values(self, tokens: Sequence[int], steps: int) -> np.ndarray:
         """Return the normalised actions (h, D) of a chunk's tokens.
 
-        h is len(tokens) / D. With a code of whole chunks, h is `steps`, also if tokens are missing.
+        h is len(tokens) / D. For FAST tokens, h is `steps`, also if tokens are missing.
         """
         if self.code is None:
             return self.values_of(np.asarray(tokens)).reshape(-1, self.dofs)

@@ -120,7 +120,7 @@ class DistanceRule(Buildable):
     def limits(self, r: int) -> tuple[int, ...]:
         """Return the largest accepted distance of each DoF, (D,) in bins, for the acceptance radius `r` in bins.
 
-        For a code of chunks, return a single distance.
+        FAST tokens encode whole chunks, so a token belongs to no DoF. For them, return a single distance.
         """
 
     def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
@@ -145,5 +145,5 @@ class StrictRule(DistanceRule):
     """Accepts only draft tokens that equal the target's. Decoding is then lossless."""
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """Return one zero for each of the D DoFs, or a single zero for a code of chunks. The radius `r` is not used."""
+        """Return one zero for each of the D DoFs, or a single zero for FAST tokens. The radius `r` is not used."""
         return (0,) * self.space.kinds

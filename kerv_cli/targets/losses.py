@@ -30,7 +30,7 @@ def soft_labels(tokens: int, sigma: float) -> Tensor:
 def labels_of(actions: ActionSpace, sigma: float) -> Tensor:
     """Return `soft_labels` for the tokens of an action space.
 
-    Tokens of a code have no distance to each other. So the true token has the probability 1, whatever `sigma` is.
+    FAST tokens have no distance to each other. So the true token has the probability 1, whatever `sigma` is.
     """
     return soft_labels(actions.tokens, sigma if actions.code is None else 0.0)
 

@@ -1,8 +1,8 @@
 """`kerv train target`: train a compact policy by behaviour cloning.
 
-One sample is one recorded control step: the observation, and the expert's next H undisturbed actions. Validation uses
-held-out episodes. Two policies with the same token accuracy may differ widely in success. So with `train.closed_loop`,
-the success in simulated episodes decides which weights are best.
+One sample is one recorded control step: the observation, and the expert's next H actions without added noise.
+Validation uses held-out episodes. Two policies with the same token accuracy may differ widely in success. So with
+`train.closed_loop`, the success in simulated episodes decides which weights are best.
 
 Shapes: B samples of a batch, N tokens of a chunk, H control steps of a chunk, D degrees of freedom of an action.
 """
@@ -247,7 +247,7 @@ def state_range(dataset: DemoDataset) -> list[list[float]]:
 class Samples(Observations):
     """The n samples that a policy is trained on: observations and the expert's chunks."""
 
-    chunks: Tensor  # (n, H, D) float32, the expert's undisturbed actions, environment units
+    chunks: Tensor  # (n, H, D) float32, the expert's actions without added noise, environment units
     places: Tensor  # (n, K, 3) float32, the positions that the target learns to estimate, metres
     episodes: Tensor  # (n,) int64, index of the sample's episode
     tasks: Tensor  # (n,) int64, index of the sample's task
@@ -530,7 +530,7 @@ def continued_target(
         settings: Shapes of the new target.
         init: The target with the initial weights.
         camera: Camera of the new target. Several views are joined by `+`.
-        code: Code of the new target's chunks. If None, each number of an action is one token.
+        code: Code of the new target's FAST tokens. If None, each number of an action is one token.
     """
     actions = replace(init.actions, code=code)
     target = CompactTarget(replace(settings), actions, init.observation, init.words, camera)

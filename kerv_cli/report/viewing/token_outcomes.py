@@ -72,10 +72,10 @@ def threshold_of(decode: DecodeRecord) -> tuple[int, ...]:
 
 
 def token_names(decodes: Sequence[DecodeRecord], dofs: Sequence[str]) -> Sequence[str]:
-    """Return the names of a control step's tokens: `dofs`, or the single name `token` if the tokens belong to a code.
+    """Return the names of a control step's tokens: `dofs`, or the single name `token` for FAST tokens.
 
-    A code encodes whole chunks, so its tokens have no DoF (docs/methods.md §0.3). Tokens are treated as tokens of a
-    code if some decode without compensation has a number of tokens that is no multiple of D.
+    FAST tokens encode whole chunks, so they have no DoF (docs/methods.md §0.3). The tokens are taken for FAST tokens if
+    some decode without compensation has a number of tokens that is no multiple of D.
     """
     for decode in decodes:
         if not decode.compensated and len(decode.tokens) % len(dofs):
@@ -112,7 +112,7 @@ def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome
     """Return the outcome of each token of a decode's chunk.
 
     A rejected token stays `rejected` even if a prediction replaced it later. All other tokens that were not executed
-    are `dropped`. With a code of whole chunks, positions after the chunk's end are `ended`.
+    are `dropped`. With FAST tokens, positions after the chunk's end are `ended`.
 
     Args:
         decode: The decode.
