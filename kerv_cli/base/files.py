@@ -120,7 +120,8 @@ def write_folder(folder: Path, fill: Callable[[Path], object]) -> None:
 def set_aside(folder: Path) -> Path:
     """Rename a folder in one step, so that every command ignores it. Return the new, temporary path.
 
-    If this process is killed before it deletes the folder, a later command does. A missing folder is no error.
+    The caller then deletes the folder. If the process is killed before that, a later command deletes it. A missing
+    folder is no error.
 
     Raises:
         StorageError: The disk is full or read-only, or permission is missing.
@@ -372,10 +373,10 @@ def remove(path: Path) -> None:
 
 
 def is_alive(pid: int, seen: float) -> bool:
-    """Return whether a process of this machine is still alive. It was alive at the time `seen`.
+    """Return whether a process of this machine, which was alive at the time `seen`, is still alive.
 
-    A later process with the same id does not count. But only Linux tells when a process began. On other systems, any
-    process with this id counts.
+    On Linux, a process that got the same id later does not count. Other systems do not tell when a process began, so
+    there any process with this id counts.
 
     Args:
         pid: Id of the process.

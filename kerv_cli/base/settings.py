@@ -24,7 +24,8 @@ def chosen(kind: str, name: str = "none") -> Callable[[], Any]:
 def part(kind: str, name: str = "none", help: str = "") -> Any:
     """Return a dataclass field that holds the settings of a part, such as a proposer.
 
-    The field's name must be a group of settings, because `GROUP=PART` on the command line chooses another part.
+    The user chooses another part with `FIELD=PART` on the command line, such as `threshold=fixed`. So the field must be
+    named like one of `SETTINGS_GROUPS` (`registry.py`).
 
     Args:
         kind: Kind of part.

@@ -1,7 +1,7 @@
 """Compute what a decode costs on average, from a profile and from how often draft tokens are accepted.
 
-A decode is a prefill, then rounds of a draft and a verification. `engine.cost` gives the costs of these steps. The
-caller says how a method drafts, or a published table does. Nothing is run, and this module needs no torch.
+A decode is a prefill, then rounds of a draft and a verification. `engine.cost` gives the costs of these steps. How
+a method drafts comes from the caller or from a published table. Nothing is run, and this module needs no torch.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Drafts:
         depth: Largest number of tokens in a drafted chain, or of levels in a tree. 0 if the method uses no drafter.
         nodes: Largest number of nodes of a drafted tree. 0 if the drafter drafts chains.
         source: What drafts once per decode, instead of the drafter or in addition to it: `early`, `scout` or
-            `retrieval`. Empty if nothing does.
+            `retrieval`. Empty if only the drafter drafts.
         in_prefill: Whether the prefill verifies the draft of `source`.
         retrieved: Share of the verified decodes in which `source` drafts instead of the drafter.
         skipped: Share of the decodes that execute the draft of `source` unverified.
@@ -196,7 +196,7 @@ def _least(enough: Callable[[float], bool]) -> float:
 
 
 TABLES = {"papers": 4, "papers_libero": 7, "main": 16}
-"""The published tables, each with N, the number of tokens per chunk in the table's decodes."""
+"""The published tables in results/tables, each with N, the number of tokens per chunk in the table's decodes."""
 
 _SOURCES = {"merged": "early", "early": "early", "scout": "scout", "scoped": "scout", "retrieval": "retrieval"}
 _DRAFTERS = ("drafter", "hybrid")

@@ -35,14 +35,17 @@ _COMPILED = 2  # bytes of a weight in a compiled network, which holds them a sec
 
 @dataclass(frozen=True)
 class Model:
-    """The model that `kerv bench` measures: a policy, or a shape of conf/target with random weights.
+    """The model that `kerv bench` measures: a trained policy, or an untrained model of a given size.
+
+    A *shape* is a file in conf/target that gives the size of a model, such as its width and number of layers. The
+    untrained model has this size and random weights.
 
     Attributes:
         name: Name of the policy or of the shape.
         target: The target, a ReadableTarget.
-        drafter: The policy's drafter. A shape, or a policy without a drafter, gets one with random weights.
+        drafter: The policy's drafter. If there is none, a drafter with random weights.
         observation: The observation to decode: all images are black, and all numbers 0.
-        is_shape: Whether the model is a shape.
+        is_shape: Whether the model is untrained, with the size that a shape gives.
     """
 
     name: str
@@ -107,9 +110,10 @@ def random_target(shape: TargetSettings, device: torch.device, dtype: torch.dtyp
 
 
 def open_model(settings: BenchSettings) -> Model:
-    """Open `settings.target` for inference: a policy, or a shape of conf/target, which gets random weights.
+    """Open `settings.target` for inference: a policy, or the name of a shape (a file in conf/target).
 
-    A shape, or a policy without a drafter, gets a drafter with random weights.
+    For a shape, the model and its drafter get random weights. A policy without a drafter gets a drafter with random
+    weights, too.
 
     Raises:
         UsageError: There is too little memory for the shape, or the policy's target has no `layers` to count.

@@ -31,8 +31,8 @@ class Family:
     Attributes:
         name: Name in the table.
         method: Method of `conf/method` that represents the family.
-        drafts: How the methods draft in the fastest case. In this case every decode that may retrieve its draft does,
-            and every decode that may skip verification does.
+        drafts: How the methods draft in the fastest case. In this case they retrieve a draft and skip verification
+            wherever they are allowed to.
         length: Published mean number of tokens committed per verification, for chunks of seven tokens. None if it is
             not published.
         reported: Speed against AR that the paper reports for its own machine. Empty if the paper reports none.
@@ -103,12 +103,14 @@ class Answer:
     Attributes:
         family: Name of the family.
         method: Method that represents the family.
-        ceiling: Speed if every draft token is accepted, and every decode that may skip verification does.
+        ceiling: Speed if every draft token is accepted, and if verification is skipped in every decode in which the
+            method may skip it.
         at_published_acceptance: Speed at the acceptance that the paper reports. None if the paper reports none.
         paper_reports: Speed that the paper reports for its own machine. None if the paper reports none.
-        at_own_acceptance: Speed at the acceptance that kerv measured. None if no published table has it.
-        own_acceptance_from: The published table, and the setting in it, in which kerv measured this acceptance. None if
-            `at_own_acceptance` is None.
+        at_own_acceptance: Speed at the acceptance that kerv measured. None if the tables in results/tables have no
+            such method.
+        own_acceptance_from: The file in results/tables that holds the measured acceptance, and the row's label. None
+            if `at_own_acceptance` is None.
         break_even_tokens: Accepted draft tokens per verification at which the family is as fast as AR. None if the
             family is always slower, or skips verification.
         is_verified: Whether the family never skips verification.
@@ -183,10 +185,9 @@ class Estimate:
 
 
 def closest(tokens: int, family: Family) -> Recorded | None:
-    """Return a published setting that has a family's method and drafts as the family does (a chain or a tree).
+    """Return a setting from results/tables that has a family's method and its kind of draft (chain or tree).
 
-    The tables are searched in the order of how close the length of their chunks is to `tokens` tokens. The first such
-    setting is returned. None if no table has such a setting.
+    The table whose chunk length is closest to `tokens` tokens is searched first. None if no table has such a setting.
     """
     for table in nearest_tables(tokens):
         for one in recorded(table):
@@ -217,7 +218,10 @@ class Anchor:
 
     @property
     def ours(self) -> float:
-        """Time of one action as kerv computes it, milliseconds."""
+        """The time of one action that kerv computes for this device and engine, to compare with the published time.
+
+        The unit is milliseconds.
+        """
         shape = SHAPES["openvla-7b"]
         shape = replace(shape, sizes=replace(shape.sizes, weight=self.weight))
         return 1e3 * priced(shape, DEVICES[self.device], self.engine).decode(ACTION)

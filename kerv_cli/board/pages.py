@@ -37,7 +37,10 @@ _OWN_CONTENT = (
 
 
 def page_of(run: str) -> str:
-    """Return the address of the page of a run, given the run's id. An artifact's id has a slash: `target/mine`."""
+    """Return the address of the page of an artifact or study, given its id.
+
+    An id with a slash, such as `target/mine`, belongs to an artifact. Any other id belongs to a study.
+    """
     return f"/artifacts/{quote(run)}" if "/" in run else f"/studies/{quote(run)}"
 
 

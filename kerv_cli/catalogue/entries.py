@@ -70,8 +70,10 @@ class RunEntry:
         figures: Main results of the entry by name, such as the success rate.
         command: Command-line arguments (without `kerv`) that made the entry. Empty if unknown.
         sha256: Hash by which other entries refer to this artifact.
-        made_from: Hashes of the artifacts that the entry was made from, by kind. If settings of a study use different
-            artifacts of a kind, the second and later artifacts have the key `KIND of LABEL`, with the setting's label.
+        made_from: Hashes of the artifacts that the entry was made from. The key is the artifact's kind, such as
+            `drafter`. If the settings of a study use several artifacts of one kind, the first has the kind as key. The
+            others have the label of their setting in the key, too: `drafter of LABEL`. The key `init` stands for the
+            target whose weights a training started from.
         labels: Texts that people wrote about the entry, with the keys `tag` and `note`.
     """
 

@@ -85,7 +85,8 @@ command = Command
 def schemas_of(part: Command) -> list[type]:
     """Return the dataclasses of all settings that can be typed after a command.
 
-    The first one is the command's own. The second one belongs to the command that `each` names, if there is one.
+    The first one is the command's own. If the field `each` of the command names another command, the second one is the
+    dataclass of that command. For example, `sweep` names `rollout`, because each setting of a sweep is a rollout.
     """
     return [part.settings, commands(part.each)[part.each].settings] if part.each else [part.settings]
 

@@ -172,22 +172,40 @@ class Chunk:
     """State of one decode: the tokens committed so far, and the rounds that committed them.
 
     The parts of a method read it and return their results. The decoder stores these results in it.
+
+    Attributes:
+        steps: H, number of control steps.
+        space: The action space.
+        situation: What is known about the running episode, such as the last executed actions.
+        target: What the target holds for this chunk, such as its cache.
+        limits: Largest accepted distance of each DoF, in bins. Early drafters choose their tokens by it.
+        choice: What the method's boundary decided about this chunk. None if the method has no boundary.
+        observation: The observation from which the chunk is decoded. None if the decoder got only a prompt.
+        tokens: The committed tokens.
+        rounds: Records of the rounds so far.
+        rejection: What follows the draft token that the last round rejected. Empty if it rejected none.
+        forwards: Number of forwards of the target so far.
+        reason: The skip rule's reason to skip or to verify. None if there is no reason.
+        closed: If a rectifier ended the chunk early: the normalised actions (S, D) of its S ≤ H control steps.
+            Otherwise None.
+        filled: If decoding went on after a rectifier's prediction: the predicted normalised values, by the index of the
+            token that each value replaces.
     """
 
-    steps: int  # H, control steps
+    steps: int
     space: ActionSpace
     situation: Situation
     target: TargetSide
-    limits: tuple[int, ...] = ()  # largest accepted distance per DoF, bins; early drafters choose their tokens by it
-    choice: Choice | None = None  # None: the method has no boundary
+    limits: tuple[int, ...] = ()
+    choice: Choice | None = None
     observation: Observation | None = None
-    tokens: list[int] = field(default_factory=list)  # committed
+    tokens: list[int] = field(default_factory=list)
     rounds: list[Round] = field(default_factory=list)
-    rejection: Rejection = Rejection()  # of the last round's verification
+    rejection: Rejection = Rejection()
     forwards: int = 0
-    reason: str | None = None  # as in `DecodeRecord`
-    closed: np.ndarray | None = None  # (steps, D) normalised actions, if a rectifier ended the chunk
-    filled: dict[int, float] = field(default_factory=dict)  # index -> normalised value that a rectifier predicted
+    reason: str | None = None
+    closed: np.ndarray | None = None
+    filled: dict[int, float] = field(default_factory=dict)
 
     @property
     def dofs(self) -> int:
@@ -320,7 +338,10 @@ class Chunk:
         self.tokens += self.space.bins_of(values).flatten()[start:].tolist()
 
     def actions(self) -> np.ndarray:
-        """Return the actions (steps, D) of the complete chunk, float32, environment units."""
+        """Return the actions (S, D) of the complete chunk, float32, environment units.
+
+        S is `steps`, or fewer if a rectifier ended the chunk early.
+        """
         values = self.closed
         if values is None:
             values = self.space.chunk_values(self.tokens, self.steps)

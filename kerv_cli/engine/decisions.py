@@ -24,7 +24,8 @@ class Rectified(NamedTuple):
     """What a rectifier predicted after a rejection.
 
     Attributes:
-        values: Normalised actions (steps, D): first the values of the committed tokens, then predicted values.
+        values: Normalised actions (S, D) of the chunk's first S control steps: first the values of the committed
+            tokens, then predicted values.
         ends: Whether the chunk ends with these actions, so that later control steps are dropped. If False, the target
             decodes the later steps.
     """

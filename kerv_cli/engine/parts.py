@@ -94,7 +94,7 @@ class Rectifier(Buildable):
         """Start a new episode."""
 
     def next_decode(self) -> None:
-        """Note that a decode has ended. Called after every decode.
+        """Tell the rectifier that a decode has ended. Called after every decode.
 
         A rectifier that pauses for some decodes after a prediction counts these decodes here.
         """

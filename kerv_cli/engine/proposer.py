@@ -20,8 +20,8 @@ class Proposer(Buildable):
 
     Attributes:
         name: Name in the records, e.g. `drafter`.
-        nodes: Maximum number of tokens in a draft, for which the cache reserves room. 0 if a draft never has more than
-            N tokens, the number of tokens in a chunk.
+        nodes: Number of draft tokens for which the cache must reserve room. The cache always has room for N, the
+            number of tokens in a chunk. So proposers that never draft more than N tokens keep the default 0.
     """
 
     name = ""

@@ -154,7 +154,8 @@ def charged(
 ) -> Certificate:
     """Set the error probability of a planned test, and record the policy's earlier tests.
 
-    The n-th test of a policy gets delta / 2^(n − 1). An identical repeat does not count as a new test.
+    The n-th test of a policy gets delta / 2^(n − 1). If exactly the same test (same candidates, seeds, margin and so
+    on) was run before, it does not count as a new test. It then gets the same error probability as before.
 
     Args:
         certificate: The planned certificate. Its `delta` is the error probability of a first test.

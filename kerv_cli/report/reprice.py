@@ -34,8 +34,8 @@ class Priced:
         result: The setting's row of the study's table, as measured, pooled over tasks.
         machine: The cost profile of the other machine.
         measures: The measures of `result`, estimated for the machine.
-        encoders: Estimated speeds per episode with other times of the vision encoder, by the keys of `ENCODERS`. Empty
-            for measured profiles.
+        encoders: Speeds per episode, estimated under three further assumptions about the time of the vision encoder.
+            The keys are those of `ENCODERS`. Empty if the profile was measured, so that the encoder's time is known.
     """
 
     result: Result

@@ -320,7 +320,8 @@ def repriced_summary(priced: Sequence[Priced]) -> pd.DataFrame:
     """Return a table of speeds to print: one row per setting.
 
     Two columns hold the measured speeds. Two more columns per machine hold the estimated speeds. If the machine's
-    profile was computed, a third column holds the speeds with other times of the vision encoder, see `ENCODERS`.
+    profile was computed instead of measured, a third column holds the speeds under further assumptions about the time
+    of the vision encoder, see `ENCODERS`.
     """
     rows: dict[str, dict[str, str]] = {}
     for row in priced:

@@ -1,6 +1,6 @@
 """Count how many draft tokens the target accepted, by their position (docs/methods.md §7).
 
-A token is *reached* if the target accepted all tokens before it in its draft.
+A token is *reached* (or *judged*) if the target accepted all tokens before it in its draft.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ class Tally:
         lengths: Entry k is the number of verifications that accepted k draft tokens.
         judged: Entry k is the number of verifications that judged k draft tokens. The judged tokens are the accepted
             tokens and, if a draft token was rejected after them, the first rejected token.
-        reached: (D,) number of reached tokens of each DoF.
+        reached: (D,) number of judged tokens of each DoF. Verification reached these tokens, because it accepted all
+            tokens before them.
         accepted: (D,) number of accepted tokens of each DoF.
     """
 

@@ -37,7 +37,8 @@ class Choice:
             setting, from the same initial state.
         baseline_success: Success rate of the baseline.
         front: Settings that no other setting beats in both speed and success, the fastest first.
-        chosen: Fastest setting that is shown to lose less success than the bound. Empty if no setting is.
+        chosen: Fastest setting that is shown to lose less success than the bound. Empty if there is no such
+            setting.
         loss_at_most: Upper bound on the chosen setting's loss of success, in points, at 95 % confidence. NaN if no
             setting is chosen.
         candidate: If no setting is chosen, the fastest setting that would be chosen after more pairs, if the rates
@@ -78,7 +79,7 @@ class Choice:
 
 
 def choices(results: Iterable[Result], task_results: Iterable[Result], loss: float) -> list[Choice]:
-    """Return the choice of a setting for all tasks together, followed by the choice for each task.
+    """Find out which setting to take: first for all tasks together, then for each task.
 
     Args:
         results: The study's rows over all tasks.
@@ -209,10 +210,10 @@ def question(results: Sequence[Result], loss: float) -> str:
 
 
 def sentence(choice: Choice, loss: float, baseline: str) -> str:
-    """Return the choice for all tasks in one sentence.
+    """Say in one sentence which setting to take for all tasks, or why no setting is recommended.
 
     Args:
-        choice: The choice.
+        choice: Which setting to take, and the numbers that the sentence reports.
         loss: Largest acceptable loss of success, in points.
         baseline: Label of the baseline.
     """
@@ -260,7 +261,7 @@ def unsolved(baseline: str, success: float) -> str:
 
 
 def short_sentence(choice: Choice) -> str:
-    """Return the choice for one task in a few words."""
+    """Say in a few words which setting to take for one task, or why no setting is recommended."""
     if choice.is_unsolved:
         return f"{choice.where}: the baseline does not solve it ({100 * choice.baseline_success:.0f} %)"
     if choice.chosen:

@@ -210,7 +210,10 @@ def compact(state: Mapping[str, Tensor], stored: str) -> dict[str, Tensor]:
 
 
 def expanded(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Convert int8 matrices that `compact` made back to float32, with their scales. Other tensors stay unchanged."""
+    """Convert int8 matrices back to float32. Each row is multiplied by its scale, which `compact` stored.
+
+    The result does not contain the scales. All other tensors stay unchanged.
+    """
     full = {}
     for name, tensor in tensors.items():
         if not (name.endswith(SCALE) and name.removesuffix(SCALE) in tensors):  # a module may have its own `….scale`

@@ -288,7 +288,10 @@ def completed(old: stored.Calibration, new: stored.Calibration) -> stored.Calibr
 
 
 def episode_windows(episode: DemoEpisode, actions: ActionSpace, window: int, horizon: int) -> np.ndarray:
-    """Cut an episode into windows, one around each control step (moment) that has `window` control steps before it.
+    """Cut out the expert's actions around each control step (moment) that has `window` control steps before it.
+
+    Near the end of the episode, a window also needs actions after the end. The recording holds such actions, because
+    the expert went on after the success.
 
     Args:
         episode: A demonstration.
@@ -297,7 +300,8 @@ def episode_windows(episode: DemoEpisode, actions: ActionSpace, window: int, hor
         horizon: Number of control steps from the moment on.
 
     Returns:
-        The expert's undisturbed actions of D DoFs around each moment (n, window + horizon, D), oldest first.
+        (n, window + horizon, D) float32: the expert's normalised actions around each of the n moments, oldest first.
+        They do not include the noise that was added when the robot executed them.
 
     Raises:
         CheckpointError: The recording holds too few actions of the expert after the episode's end.

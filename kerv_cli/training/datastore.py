@@ -129,7 +129,7 @@ def entries_of(target: Any, episode: DemoEpisode, space: ObservationSpace, key: 
 
     Returns:
         The values of each column, one row per entry. The column `keys` holds the encoded observations, and `tokens` the
-        expert's next H undisturbed actions.
+        expert's next H actions without added noise.
     """
     steps = observed_steps(episode, bool(target.cameras))
     tokens = target.actions.chunk_tokens(read_chunks(episode, steps, target.chunk))

@@ -34,17 +34,17 @@ class CertifiedSkipSettings:
 
 @dataclass
 class ScopedSettings:
-    """On the certificate's tasks, draft with the certified proposer. On other tasks, use the proposer `outside`."""
+    """On the certificate's tasks, draft with the certified proposer. On other tasks, use another proposer."""
 
     kind: str = "scoped"
-    outside: str = "merged"  # prefill draft on other tasks
+    outside: str = "merged"  # name of the proposer for other tasks
 
     def check_together(self, prefix: str) -> None:
-        """Refuse a proposer `outside` that cannot draft whole chunks before the prefill.
+        """Refuse a proposer for other tasks (setting `outside`) that cannot draft whole chunks before the prefill.
 
         Raises:
-            UsageError: `outside` cannot draft whole chunks before the prefill.
-            UnknownName: No proposer has the name `outside`.
+            UsageError: That proposer cannot draft whole chunks before the prefill.
+            UnknownName: No proposer has the name in the setting `outside`.
         """
         outside = ProposerPart.find(self.outside, "prefill_draft.outside")
         if not (outside.merged or outside.chains):
@@ -72,7 +72,7 @@ def covering(context: Context) -> Certificate | None:
 
 
 def needs_outside(settings: ScopedSettings) -> tuple[str, ...]:
-    """Return the kinds of artifacts needed: the certificate, and what the proposer for other tasks (`outside`) needs.
+    """Return the kinds of artifacts needed: the certificate, and those of the proposer for other tasks.
 
     The certificate itself lists what the certified proposer needs (`CertificateArtifact.needs`).
     """
@@ -84,7 +84,8 @@ def needs_outside(settings: ScopedSettings) -> tuple[str, ...]:
 def scoped(settings: ScopedSettings, context: Context) -> Proposer:
     """Build the proposer for the decoder's task.
 
-    It is the certified proposer if the certificate covers the task and certifies a candidate, else `outside`.
+    It is the certified proposer if the certificate covers the task and certifies a candidate. Otherwise it is the
+    proposer that the setting `outside` names.
     """
     certificate = covering(context)
     if certificate is not None and certificate.certified is not None:

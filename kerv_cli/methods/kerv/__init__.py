@@ -93,7 +93,7 @@ def find_predictor(name: str) -> PredictorPart:
 
 @dataclass
 class CompensateSettings:
-    """KERV: after a rejected draft token, predict the rest of the token's control step."""
+    """KERV: after a rejected draft token, predict the rest of the token's control step (see `Compensation`)."""
 
     kind: str = "compensate"
     # kalman, damped, hold, linear (ours); walk (public code); draft: the rejected draft's remaining tokens (ours)
@@ -101,9 +101,9 @@ class CompensateSettings:
     hold_strict: bool = True  # true: strict DoFs keep their last value (ours); false: predicted like others (summary)
     steps: int = number(1, 1, MOST_TOKENS)  # control steps that a prediction may fill (paper: predict length PL)
     use_target_token: bool = True  # true: keep the target's token at the rejected position (ours); false: predict it
-    drop: bool = True  # true: end the chunk after the filled steps (ours); false: decode on, drop nothing (paper)
+    drop: bool = True  # true: end the chunk after the filled steps (ours); false: decode the later steps (paper)
     min_verified: int = number(1, 0, MOST_TOKENS)  # fill a control step only if it has this many committed DoFs
-    rest: int = number(0, 0, MOST_DECODES)  # after a compensation, number of decodes without one (KERV: 4)
+    rest: int = number(0, 0, MOST_DECODES)  # after a compensation, compensate nothing for this many decodes (KERV: 4)
 
     def check_together(self, prefix: str) -> None:
         """Refuse an unknown predictor, and `predictor=draft` with `use_target_token=false`.
@@ -156,13 +156,13 @@ class Compensation(Rectifier):
         self.resting = 0
 
     def next_decode(self) -> None:
-        """Count a finished decode. The setting `rest` needs the count."""
+        """Count a finished decode. After a compensation, nothing is compensated for `settings.rest` decodes."""
         self.resting = max(0, self.resting - 1)
 
     def rectify(self, chunk: Chunk) -> Rectified | None:
         """Predict the missing values of the rejected control step, and of further steps if `steps` is above 1.
 
-        Return None if the rectifier rests, or if nothing can be predicted.
+        Return None if nothing can be predicted, or if a recent decode was compensated (setting `rest`).
         """
         from kerv_cli.methods.kerv.prediction import assemble
 

@@ -81,7 +81,7 @@ def filter_state(ratio: float, window: int, damping: float) -> tuple[np.ndarray,
 
 
 def kalman_weights(q: float, r: float, window: int, horizon: int, damping: float = 1.0) -> np.ndarray:
-    """Return the weights (horizon, window) of a Kalman filter's predictions for one DoF.
+    """Return the weights (horizon, window) of the past actions in a Kalman filter's predictions for one DoF.
 
     Row h − 1 times the last `window` actions (oldest first) is the prediction h control steps ahead.
 
@@ -116,7 +116,9 @@ class Predictor:
         window: int = WINDOW,
         horizon: int = HORIZON,
     ) -> None:
-        """Compute the weights for all numbers of past actions from `minimum` to `window`.
+        """Compute the weights of the past actions in the predictions.
+
+        They are computed once for each possible number of past actions, from `minimum` to `window`.
 
         Args:
             held: (D,) bool, whether the DoF keeps its last value.
@@ -135,7 +137,10 @@ class Predictor:
             self.tables[past] = table
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return the weights (horizon, window) for one DoF. This base class puts all weight on the newest action.
+        """Return the weights (horizon, window) of the past actions in the predictions for one DoF.
+
+        Row h − 1 times the past actions (oldest first) is the prediction h control steps ahead. In this base class,
+        only the newest action has a weight other than 0.
 
         Args:
             dof: Index of the DoF.
@@ -188,7 +193,7 @@ class Linear(Predictor):
     least = 2
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return the weights (horizon, window).
+        """Return the weights (horizon, window) of the past actions in the predictions.
 
         For h steps ahead, the newest action has the weight 1 + h, and the action before it has the weight −h.
         """
@@ -228,7 +233,10 @@ class Walk(Predictor):
     noise_ratio = 1.0 / 1e-3  # Q / R
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return the weights (horizon, window). All rows are equal: every prediction is the filtered last action."""
+        """Return the weights (horizon, window) of the past actions in the predictions.
+
+        All rows are equal. The filter has no velocity, so it predicts its estimate of the last action for every step.
+        """
         state, variance = np.eye(1, window)[0], 1.0  # all variances divided by R
         for newest in np.eye(window)[1:]:
             variance += self.noise_ratio
@@ -238,10 +246,11 @@ class Walk(Predictor):
 
 
 class Ridge(Predictor):
-    """SP-VLA: continues the line through the last `window` actions, fitted by ridge regression on time.
+    """SP-VLA: fits a line to the past actions of each DoF by ridge regression on time, and continues the line.
 
     Attributes:
         penalty: Ridge penalty λ of slope and intercept.
+        window: Number of past actions that the line is fitted to. With fewer past actions, nothing is predicted.
     """
 
     name = "ridge"
@@ -251,7 +260,7 @@ class Ridge(Predictor):
         super().__init__(held, None, window, window, horizon)
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return the weights (horizon, window): X' (XᵀX + λI)⁻¹ Xᵀ, where λ is the penalty.
+        """Return the weights (horizon, window) of the past actions: X' (XᵀX + λI)⁻¹ Xᵀ, where λ is the penalty.
 
         X has one row (t, 1) for each past control step t = 0, 1, …. X' has one such row for each future control step.
         """
@@ -294,7 +303,7 @@ def assemble(
 
     `settings.steps` control steps are filled, beginning with the first step that is not completely known. That first
     step is left out, and one step fewer is filled, if fewer than `min_verified` of its DoFs are known. It is also left
-    out if none of its DoFs is known and `drop` is set. The first step of the chunk is never left out.
+    out if none of its DoFs is known and the setting `drop` is true. The first step of the chunk is never left out.
 
     Args:
         tokens: Known tokens of the chunk: accepted draft tokens and tokens of the target.

@@ -356,7 +356,7 @@ def elementwise(code, frame, columns, numbers, indices):
         frame: (size,) float32.
         columns: The operation's line in the table of operations, see `recording.COLUMNS`.
         numbers: Constants of all operations.
-        indices: Indices in the frame that GATHER operations copy from.
+        indices: For all GATHER operations, the indices in the frame of the elements that they copy.
     """
     out, a, b = columns[1], columns[2], columns[3]
     rows, width, stride, first = columns[4], columns[5], columns[6], columns[7]

@@ -170,11 +170,15 @@ class Recorded:
 class Tape:
     """The operations that were recorded so far, and their constants.
 
+    A frame is the float32 memory of one row of the batch. A place is an index in the frame.
+
     Attributes:
         ops: One dictionary per operation, with the names in COLUMNS as keys.
         numbers: Constant arrays, such as norm gains.
-        indices: Indices in the frame that GATHER operations copy from.
-        begins: The first place of every register. The last entry is where the next register will begin.
+        indices: Places of the elements that GATHER operations copy: those of the first such operation, then those of
+            the second, and so on.
+        begins: First place of each register. A register is the range of places that holds one tensor. The last entry
+            is the first place of the next register.
         cache: Three numbers for the cache: layers with attention, heads of a layer, channels of a head.
     """
 
@@ -205,7 +209,8 @@ class Tape:
         Args:
             code: What the operation computes, such as LINEAR.
             out: Value that receives the result, or the shape of a new register for the result.
-            inputs: One or two values that the operation reads. The second value counts as a single row.
+            inputs: One or two values that the operation reads. The first value is read in rows of `width` elements. The
+                second value is read as one row with all its elements, whatever its shape is.
             width: Number of elements in each row of the first input.
             numbers: Constants that the operation reads, such as a norm's gain.
             **columns: Further entries of the operation, with the names in COLUMNS.
