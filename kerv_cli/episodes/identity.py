@@ -137,8 +137,8 @@ def _canonical(value: object) -> str:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
 
 
-# Settings that version 1.0.0 did not have, and the values that do what it did. Such values are not hashed, so
-# episodes that were stored before keep their identity.
+# Settings that version 1.0.0 did not have. With these values, kerv decodes like version 1.0.0. So these values are not
+# hashed, and episodes that were stored before keep their identity.
 LATER: Mapping[str, Any] = {"threshold.over": "compared", "threshold.total": False, "rectifier.hold_strict": True}
 
 

@@ -324,7 +324,7 @@ def study_name(study: str) -> str:
 
 
 def _outranked(overrides: Iterable[str], by: Sequence[str]) -> list[str]:
-    """Combine two lists of overrides. For keys in both lists, `by` wins."""
+    """Combine two lists of overrides. If both contain a key, the value in `by` counts."""
     _, others = _parted(overrides, set(map(_key, by)))
     return [*others, *by]
 

@@ -225,7 +225,7 @@ class Run:
         return self
 
     def beat(self, done: int, total: int | None = None) -> None:
-        """Note progress, to be written with the next heartbeat. If `total` changes, it is written at once.
+        """Store the progress, which the next heartbeat writes. If `total` changes, it is written at once.
 
         Args:
             done: Number of steps or episodes that are finished.
@@ -284,7 +284,7 @@ def _name_in(database: Database, kind: str, folder: Path) -> str:
 
 
 def making(database: Database, kind: str, folder: Path) -> Run:
-    """Return the run (see `Run`) of a command that makes an artifact (weights or data).
+    """Return a new `Run` for a command that makes an artifact (weights or data). Use it in a `with` statement.
 
     Args:
         database: The database.

@@ -404,7 +404,7 @@ class Queue:
             raise ClaimLost("the worker was silent for too long, or the study was deleted")
 
     def begin(self, claim: Claim, one: Episode) -> None:
-        """Note that an episode, or the preparation of its setting, begins."""
+        """Write into the database that an episode, or the preparation of its setting, begins."""
         with self.database.writing() as connection:
             self.hold(connection, claim, one)
 
@@ -573,7 +573,7 @@ class _Attempt:
                     self._end(one, record, order, started)
 
     def _try(self, one: Episode, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call a function for episode `one`. If it raises, note that the episode's setting failed, and return None."""
+        """Call a function for episode `one`. If it raises, report that the setting failed, and return None."""
         self._begin(one)
         try:
             return function(*arguments)
@@ -582,7 +582,7 @@ class _Attempt:
         return None
 
     def _begin(self, one: Episode) -> None:
-        """Note that an episode, or the preparation of its setting, begins."""
+        """Write into the database that an episode, or the preparation of its setting, begins. Write it only once."""
         if one is not self.running:
             patiently(self.queue.begin, self.claim, one)
             self.running = one
@@ -637,7 +637,7 @@ class _Attempt:
                 "started": self.started, "code": code_hash(), "about": about}  # fmt: skip
 
     def _fail(self, one: Episode, failure: SettingFailed) -> None:
-        """Note that a setting failed on a task. Its remaining episodes in the block will not run.
+        """Report that a setting failed on a task. Its remaining episodes in the block will not run.
 
         Raises:
             StorageError: The setting failed with this error. No other setting could be stored either.

@@ -211,7 +211,7 @@ class Calibration:
 
 
 class CalibrationArtifact(Artifact[Calibration]):
-    """The kind of artifact `calibration`. It is a single file, and every `path` here is the path of that file."""
+    """Finds, checks and loads calibrations. A calibration is a single file. Every `path` is the path of that file."""
 
     kind = noun = "calibration"
     made, command = "made", ("calibrate",)

@@ -57,12 +57,12 @@ class Method:
 
     @property
     def prefill_draft(self) -> registry.ProposerPart:
-        """The part that drafts before the prefill."""
+        """The registered proposer that drafts before the prefill."""
         return registry.ProposerPart.find(self.settings["prefill_draft"].kind, "prefill_draft.kind")
 
     @property
     def proposer(self) -> registry.ProposerPart:
-        """The part that drafts after the prefill."""
+        """The registered proposer that drafts after the prefill."""
         return registry.ProposerPart.find(self.settings["proposer"].kind, "proposer.kind")
 
     @property

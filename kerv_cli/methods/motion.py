@@ -139,5 +139,5 @@ class Coarse(Boundary):
         return cls(settings, context)
 
     def choose(self, path: np.ndarray) -> Choice:
-        """Return a choice that limits the number of tokens. The hand's path is not used."""
+        """Limit the number of tokens of the next chunk (setting `tokens`). The limit is fixed: `path` is not used."""
         return Choice("drafter", most=self.settings.tokens)

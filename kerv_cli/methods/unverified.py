@@ -83,8 +83,8 @@ class StreakSkip(Skip):
     """Executes drafts without verification, as long as verified drafts agree with the target.
 
     After the first verified chunk that agrees with its draft, 1 decode is not verified. Each further agreement doubles
-    this number, up to `most`. A chunk that does not agree with its draft resets the number to 0. An episode begins with
-    `opening` decodes without verification.
+    this number, up to the setting `most`. A chunk that does not agree with its draft resets the number to 0. The
+    setting `opening` is the number of decodes without verification at the start of an episode.
 
     Attributes:
         source: The proposer of the drafts.

@@ -135,8 +135,8 @@ def report(
 ) -> list[Report]:
     """Write the tables, plots and page of one study, or of every study that has an episode. Return a report of each.
 
-    The tables are <study>.csv, <study>_per_task.csv, <study>.json and, with `on`, <study>_on.csv. The same episodes
-    give the same bytes.
+    The tables are <study>.csv, <study>_per_task.csv, <study>.json and, if `on` names a profile, <study>_on.csv. The
+    same episodes give the same bytes.
 
     Args:
         database: The database. Files are written to its results folder.

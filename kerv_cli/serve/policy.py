@@ -45,8 +45,8 @@ class Policy:
 
     Attributes:
         chunk: H, number of control steps in an answer.
-        by_task: Whether a decoder depends on the task, because the method's calibrated values or drafts do. If so,
-            clients must name the task.
+        by_task: Whether a decoder depends on the task. This is so if the method's calibrated values or drafts depend on
+            the task. Then clients must name the task.
         low: (p,) lower ends of the ranges in which the policy may act, one per number of the state: the range of the
             demonstrations plus a margin. (s,) if the policy reads the whole simulator state. Empty if the checkpoint
             stores no range, or if the policy reads no state.

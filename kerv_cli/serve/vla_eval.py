@@ -141,7 +141,7 @@ class VlaEval(Conversation):
         return self._message("hello", about)
 
     def _start(self, payload: Message) -> None:
-        """Note that a new episode begins.
+        """Begin a new episode.
 
         A decoder for the episode's task is built at the first observation. Only then are errors in `payload` reported.
         """

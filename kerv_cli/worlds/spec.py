@@ -90,7 +90,7 @@ class EnvironmentSpec:
         upside_down: Cameras whose raw images must be rotated by 180 degrees.
         suffix: Ending of all full task names. Users may leave it out.
         packages: Python packages whose versions determine the physics. The first one is the simulator's.
-        extra: Extra of kerv that installs the simulator (`pip install 'kerv[EXTRA]'`). Empty if kerv itself does.
+        extra: Extra of kerv that installs the simulator (`pip install 'kerv[EXTRA]'`). Empty if no extra is needed.
         grip: Value of the gripper's DoF that closes the gripper, then the value that opens it. Empty if there is no
             gripper.
         seeds: Ranges of episode seeds.

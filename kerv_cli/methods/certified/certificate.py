@@ -74,7 +74,7 @@ class Attempt:
         margin: Percentage points of success that may be lost.
         delta: Level of the test: an upper bound of the probability that the test certifies falsely.
         pairs: Number of pairs of episodes.
-        certified: Label of the last candidate in `order` that was certified. Empty if none was.
+        certified: Label of the last candidate in `order` that was certified. Empty if no candidate was certified.
     """
 
     made: str
@@ -222,7 +222,7 @@ class Certificate:
 
 
 class CertificateArtifact(Artifact[Certificate]):
-    """The kind of artifact `certificate`: a folder with a single JSON file."""
+    """Finds, checks and loads certificates. A certificate is a folder with a single JSON file."""
 
     kind, noun, made = "certificate", "certificate", "issued"
     command = ("calibrate", "success")

@@ -232,7 +232,7 @@ class EagleDescription(DrafterDescription):
 
 
 class EagleDrafter(TrainableDrafter):
-    """The kind of artifact `drafter`: an EAGLE-style drafter. It works for chunks of any length."""
+    """EAGLE-style drafters, which are artifacts of the kind `drafter`. They work for chunks of any length."""
 
     kind = noun = "drafter"
     command = ("train", "drafter")

@@ -243,7 +243,10 @@ class EarlyExamples(Decodes):
 
 
 class EarlyDrafter(TrainableDrafter):
-    """The kind of artifact `early`. It learns the target's greedy tokens, with labels spread over neighbouring bins."""
+    """Early drafters, which are artifacts of the kind `early`.
+
+    They learn the target's greedy tokens, with labels spread over neighbouring bins.
+    """
 
     kind, noun = "early", "early drafter"
     settings: type[Any] = EarlySettings
@@ -493,7 +496,7 @@ class ScoutExamples(Observations, Decodes):
 
 
 class ScoutDrafter(EarlyDrafter):
-    """The kind of artifact `scout`: a drafter with its own vision encoder, for targets with cameras.
+    """Scouts: drafters with their own vision encoder, for targets with cameras. They are artifacts of the kind `scout`.
 
     In the first `train.scene_steps` steps of the training, the scout learns only to estimate positions.
     """

@@ -335,7 +335,7 @@ class Always(Boundary):
     """Makes the same choice for every chunk: boundary=always_retrieval or boundary=always_drafter."""
 
     def choose(self, path: np.ndarray) -> Choice:
-        """Choose retrieval or the drafter, whichever the boundary's name says. The hand's path is not used."""
+        """Choose the proposer that the boundary's name says: retrieval or the drafter. The hand's path is not used."""
         return Choice(self.settings.kind.removeprefix("always_"))
 
 
@@ -418,8 +418,9 @@ class VerifySkip(Skip):
     must choose retrieval. Once the last chunk of a stored episode has been executed, no chunk of that stored episode
     is executed without verification in the rest of the robot's own episode.
 
-    With `up` or `down` above 0, s_min changes after each episode. A failure raises it by `up` times the calibrated
-    range (high − low), a success lowers it by `down` times the range. Then results depend on the order of the episodes.
+    If the setting `up` or `down` is above 0, s_min changes after each episode. Let R be the calibrated range of s_min,
+    high − low. A failure raises s_min by up · R, a success lowers it by down · R. Then results depend on the order of
+    the episodes.
     """
 
     def __init__(

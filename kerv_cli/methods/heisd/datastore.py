@@ -287,7 +287,7 @@ def _read_payload(path: Path) -> dict[str, np.ndarray]:
 
 
 class DatastoreArtifact(Artifact[Manifest]):
-    """The kind of artifact `datastore`: a folder with demonstrated chunks, which `Datastore` opens."""
+    """Finds, checks and loads datastores. A datastore is a folder with demonstrated chunks, which `Datastore` opens."""
 
     kind = noun = "datastore"
     made, command, again = "built", ("build", "datastore"), AGAIN
