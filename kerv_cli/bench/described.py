@@ -51,7 +51,8 @@ class Described:
         shape: Shape of the policy. None if the policy emits no action tokens.
         tokens: N, tokens of a chunk. 0 if the policy emits no action tokens.
         assumed: Assumptions about the policy, one phrase each.
-        encoder: Seconds of the vision encoder, if the user states them. None if they are computed from the shape.
+        encoder: Seconds that the vision encoder takes for one observation, if the user states them (`vision=8ms`). None
+            if they are computed from the shape.
     """
 
     shape: Shape | None

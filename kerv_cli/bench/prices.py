@@ -98,7 +98,7 @@ def costs_of(settings: EstimateSettings, policy: Described | None) -> Iterator[t
 
 @dataclass(frozen=True)
 class Answer:
-    """The speed of a family of methods with an engine. Every speed is against AR: 2.0 means twice as fast.
+    """How fast a family of methods is, for one policy on one machine. Speeds are against AR: 2.0 means twice as fast.
 
     Attributes:
         family: Name of the family.
@@ -129,7 +129,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Estimate:
-    """How fast speculative decoding can make a policy that runs on an engine.
+    """How fast speculative decoding can make a policy, for given costs of the policy's operations.
 
     Attributes:
         costs: Seconds of each operation of the policy's decodes.
@@ -240,12 +240,14 @@ ANCHORS = (
 
 @dataclass(frozen=True)
 class Projection:
-    """The computed times of a shape on a device with an engine.
+    """Computed times of a model's decodes on a device. Nothing was measured.
+
+    The times follow from the model's shape, that is from the sizes of its layers and the lengths of its sequences.
 
     Attributes:
         name: Name of the profile, such as `a100-openvla-7b-eager`.
         device: The device.
-        engine: The engine.
+        engine: The code that runs the model, such as `eager`.
         profile: Seconds of each phase of a decode.
         floors: The shortest seconds that the device allows, for the same phases.
     """
@@ -278,7 +280,7 @@ class Projection:
 
 
 def projections(settings: BenchSettings) -> Iterator[Projection]:
-    """Yield the times of the shape `settings.projected` on each device of `settings.projections` with each engine."""
+    """Yield the times of the model `settings.projected`, for each device in `settings.projections` and each engine."""
     shape: Shape = SHAPES[settings.projected]
     for name, (bandwidth, flops) in settings.projections.items():
         title = DEVICES[name].title if name in DEVICES else name

@@ -36,7 +36,10 @@ class BatchDecoder:
         self._caches: dict[int, Cache] = {}
 
     def new_episode(self) -> Follower:
-        """Return a `Follower` for one more episode of the batch. It holds no actions or positions yet."""
+        """Return a `Follower` for one more episode of the batch.
+
+        A `Follower` stores the actions and the positions of the hand during one episode. This one is still empty.
+        """
         return Follower(self.target.actions, self.target.cameras)
 
     @torch.inference_mode()

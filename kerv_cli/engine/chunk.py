@@ -117,7 +117,7 @@ class Follower:
 
 @dataclass(frozen=True)
 class Rejection:
-    """What follows a rejected draft token.
+    """Tokens of the draft and of the target after a rejected draft token.
 
     Attributes:
         draft: The n draft tokens after the rejected one.
@@ -178,12 +178,14 @@ class Chunk:
         space: The action space.
         situation: What is known about the running episode, such as the last executed actions.
         target: What the target holds for this chunk, such as its cache.
-        limits: Largest accepted distance of each DoF, in bins. Early drafters choose their tokens by it.
+        limits: Largest accepted distance of each DoF, in bins. Early drafters choose the tokens that are most likely to
+            be accepted within these distances.
         choice: What the method's boundary decided about this chunk. None if the method has no boundary.
         observation: The observation from which the chunk is decoded. None if the decoder got only a prompt.
         tokens: The committed tokens.
         rounds: Records of the rounds so far.
-        rejection: What follows the draft token that the last round rejected. Empty if it rejected none.
+        rejection: Tokens of the draft and of the target after the draft token that the last round rejected, see
+            `Rejection`. Empty if the last round rejected no token.
         forwards: Number of forwards of the target so far.
         reason: The skip rule's reason to skip or to verify. None if there is no reason.
         closed: If a rectifier ended the chunk early: the normalised actions (S, D) of its S ≤ H control steps.
@@ -279,7 +281,7 @@ class Chunk:
         Args:
             record: The record of this round.
             tokens: The tokens to commit.
-            rejection: The tokens of draft and target after the rejected token. None if no token was rejected.
+            rejection: Tokens of the draft and of the target after the rejected token. None if no token was rejected.
         """
         self.forwards += 1
         self.tokens += tokens
@@ -312,7 +314,7 @@ class Chunk:
         self.rounds.append(Round("skip", proposer, drafted=drafted, accepted=size, committed=size))
 
     def until_end(self, tokens: Sequence[int]) -> list[int]:
-        """Return the tokens up to the first end token. Without an end token, return all."""
+        """Return the tokens up to and including the first end token. If there is no end token, return all tokens."""
         found, end = list(tokens), self.space.end
         return found[: found.index(end) + 1] if end is not None and end in found else found
 

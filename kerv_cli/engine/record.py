@@ -73,14 +73,24 @@ class Round:
 
 @dataclass(frozen=True)
 class Delay:
-    """Latency of a decode in a world that does not wait, and what the robot did meanwhile (docs/methods.md §8)."""
+    """Latency of a decode in a world that does not wait, and what the robot did meanwhile (docs/methods.md §8).
 
-    seconds: float  # latency of the decode
-    steps: int  # latency in control steps, rounded up
-    observed: int  # control step at which the observation was taken
-    carried: int = 0  # steps that executed the previous chunk; carried + held < steps if the episode ended
-    held: int = 0  # steps that held the last action
-    dropped: int = 0  # first actions of the new chunk that are not executed, because they are too old
+    Attributes:
+        seconds: Latency of the decode, in seconds.
+        steps: Latency in control steps, rounded up.
+        observed: Control step of the episode at which the observation was taken, from 0.
+        carried: Number of control steps during the decode that executed the rest of the previous chunk.
+        held: Number of control steps during the decode that repeated the last action. carried + held equals `steps`,
+            and is smaller only if the episode ended during the decode.
+        dropped: Number of actions at the start of the new chunk that are not executed, because they are too old.
+    """
+
+    seconds: float
+    steps: int
+    observed: int
+    carried: int = 0
+    held: int = 0
+    dropped: int = 0
 
 
 @dataclass(frozen=True)

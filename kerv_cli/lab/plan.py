@@ -27,8 +27,9 @@ FULL_BATCHES = 16
 NEVER, TIMED, CHANGED, ALL = "never", "timed", "changed", "all"
 """Values of `rerun=`, which says which existing episodes to run again.
 
-NEVER runs no existing episode again. TIMED runs the episodes again that did not take turns with all other settings in
-one block. CHANGED runs the episodes again that ran with another version of the code. ALL runs all episodes again.
+NEVER runs no existing episode again. TIMED runs the episodes of a task, seed and repeat again unless one block ran them
+for all settings in turn. CHANGED runs the episodes again that ran with another version of the code. ALL runs all
+episodes again.
 """
 
 Key = tuple[str, str, int, int]
@@ -189,10 +190,12 @@ def split(
         episodes: The study's episodes.
         block: Number of seeds in a block, which one process runs.
         stored: Episodes in the database, by `Episode.key`.
-        rerun: Which existing episodes to run again: none (NEVER), those whose settings did not take turns in one block
-            (TIMED), those that ran with another version of the code (CHANGED), or all (ALL).
+        rerun: Which existing episodes to run again. NEVER: none. TIMED: for each task, seed and repeat, the episodes of
+            all settings, unless one block ran all of them in turn. Only then can their times be compared. CHANGED: the
+            episodes that ran with another version of the code. ALL: all.
         since: Used only with ALL, if a command is resumed: the time at which it first began (ISO 8601). Episodes of
-            blocks that began later count as existing, because this command ran them. If empty, all episodes run again.
+            blocks that began then or later count as existing, because this command ran them. If empty, all episodes
+            run again.
         earlier: The newest stored setting and its hash, by label. Used to explain what has changed.
 
     Returns:

@@ -234,7 +234,8 @@ class Study:
         Args:
             rerun: Which existing episodes to run again: NEVER, TIMED, CHANGED or ALL (`lab/plan.py`).
             since: Used only with ALL, if an interrupted command is resumed: the time at which that command began (ISO
-                8601). If empty, all episodes run again.
+                8601). Episodes of blocks that began then or later do not run again, because that command ran them. If
+                empty, all episodes run again.
             runtime: Executor, workers and device.
             command: Command-line arguments (without `kerv`) that resume the study.
         """

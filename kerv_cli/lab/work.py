@@ -410,7 +410,10 @@ class Queue:
 
     @contextlib.contextmanager
     def beating(self) -> Iterator[None]:
-        """Write the heartbeat of the claimed block during the `with` block. At the end, free that block."""
+        """Keep this worker's claim alive during a `with` statement: write its heartbeat every BEAT_SECONDS seconds.
+
+        At the end of the `with` statement, the block of episodes that this worker has claimed becomes free again.
+        """
         ended = threading.Event()
 
         def beat() -> None:
@@ -436,9 +439,10 @@ class Queue:
                     connection.execute(freed.values(worker=None, heartbeat=None, running=None))
 
     def left(self) -> tuple[int, int]:
-        """Return how many blocks have not ended, and how many of these blocks no other live worker has claimed.
+        """Return the number of blocks that have not ended, and how many of these this worker could claim now.
 
-        This method only reads the database, so no worker has to wait for it.
+        This worker can claim a block unless another worker has claimed it and still writes heartbeats. This method only
+        reads the database, so no worker has to wait for it.
         """
         with self.database.reading() as connection:
             is_open = sa.case((self._is_open(connection), 1), else_=0)

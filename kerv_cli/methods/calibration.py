@@ -73,9 +73,9 @@ class BoundarySection:
 class SkipLevel:
     """The threshold s_min of a task: the similarity at which verification is skipped (docs/methods.md §4.3).
 
-    Similarities are cosines. To measure the threshold, each entry's neighbour was looked up: the most similar entry in
-    the other episodes of the datastore. The neighbour is good if its chunk is close to the entry's chunk
-    (`SkipSection.epsilon`).
+    Similarities are cosines. To measure the threshold, entries of the datastore were compared with their neighbours. An
+    entry's neighbour is the most similar entry of another episode. A neighbour is good if its chunk is close to the
+    entry's chunk (`SkipSection.epsilon`).
 
     Attributes:
         s_min: A stored chunk is executed without verification if the similarity of its observation is at least `s_min`.
@@ -83,9 +83,10 @@ class SkipLevel:
         high: Highest value of `s_min` that such a skip rule may set.
         share: Share of the entries whose neighbour has a similarity of at least `s_min`.
         entries: Number of entries whose neighbours were looked up.
-        within: Share of good neighbours among the neighbours that reach `s_min`. None if no neighbour reaches `s_min`.
-        error: Mean absolute difference between an entry's chunk and its neighbour's, over the neighbours that reach
-            `s_min`, in normalised action units. None if no neighbour reaches `s_min`.
+        within: Share of good neighbours among the neighbours with a similarity of at least `s_min`. None if there are
+            no such neighbours.
+        error: Mean absolute difference between the chunks of an entry and its neighbour, in normalised action units.
+            Only neighbours with a similarity of at least `s_min` count. None if there are no such neighbours.
     """
 
     s_min: float
@@ -99,14 +100,18 @@ class SkipLevel:
 
 @dataclass(frozen=True)
 class SkipSection:
-    """The thresholds at which verification is skipped, for one datastore.
+    """The similarities from which on verification is skipped, for one datastore.
+
+    To measure them, entries of the datastore were compared with their neighbours. An entry's neighbour is the most
+    similar entry of another episode.
 
     Attributes:
         datastore: Hash of the datastore.
-        epsilon: A neighbour is good if its chunk differs from the entry's by at most `epsilon`, as mean absolute
-            difference in normalised action units. Strict tokens, such as the gripper's, must also be equal.
-        confidence: Minimum share of good neighbours among the neighbours that reach the threshold.
-        tasks: Threshold of each task.
+        epsilon: A neighbour is good if the distance between its chunk and the entry's chunk is at most `epsilon`. The
+            distance is the mean absolute difference in normalised action units. Strict tokens, such as the gripper's,
+            must also be equal.
+        confidence: Minimum share of good neighbours among the neighbours whose similarity is at least `s_min`.
+        tasks: The threshold `s_min` of each task, with its bounds.
     """
 
     datastore: str

@@ -61,7 +61,11 @@ class MotionRule(DistanceRule):
 
     @classmethod
     def build(cls, settings: Any, context: Context) -> MotionRule:
-        """Build the rule that the setting `acceptance=motion` chooses."""
+        """Check that the target decodes FAST tokens, and build the rule (`acceptance=motion`).
+
+        Raises:
+            UsageError: The target has no FAST code.
+        """
         code_of(context, "acceptance=motion")
         return cls(context.target.actions, settings.tolerance)
 
@@ -134,7 +138,11 @@ class Coarse(Boundary):
 
     @classmethod
     def build(cls, settings: Any, context: Context) -> Coarse:
-        """Build the boundary that `boundary=coarse` chooses."""
+        """Check that the target decodes FAST tokens, and build the boundary (`boundary=coarse`).
+
+        Raises:
+            UsageError: The target has no FAST code.
+        """
         code_of(context, "boundary=coarse")
         return cls(settings, context)
 

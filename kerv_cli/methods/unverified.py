@@ -45,7 +45,7 @@ class ParallelPass(Skip):
 
     @classmethod
     def build(cls, settings: NoSettings, context: Context) -> ParallelPass:
-        """Build the part that the setting `skip=parallel` chooses."""
+        """Build the skip rule for a parallel target (`skip=parallel`)."""
         return cls(context.target)
 
     def take(self, chunk: Chunk) -> SkipDecision:
@@ -104,7 +104,7 @@ class StreakSkip(Skip):
         self.chain: tuple[int, ...] = ()
 
     def begin(self, task: str, seed: int) -> None:
-        """Begin an episode. The setting `opening` says how many of its first decodes may go unverified."""
+        """Begin an episode. Its first `settings.opening` decodes may execute their drafts without verification."""
         self.allowed = self.left = self.settings.opening
 
     def take(self, chunk: Chunk) -> SkipDecision:
@@ -141,7 +141,7 @@ class AlwaysSkip(Skip):
 
     @classmethod
     def build(cls, settings: NoSettings, context: Context) -> AlwaysSkip:
-        """Build the part that the setting `skip=always` chooses."""
+        """Build the skip rule, which executes the method's prefill drafts (`skip=always`)."""
         return cls(context.built["prefill_draft"])
 
     def take(self, chunk: Chunk) -> SkipDecision:

@@ -113,8 +113,8 @@ def planned_certificate(
         settings: Settings of the test.
 
     Raises:
-        UsageError: The policy was tested before and `settings.again` is not set. Or another study or an earlier test
-            ran the policy on one of these seeds.
+        UsageError: A different test of this policy was run before and `settings.again` is not set. Or another study or
+            a different earlier test ran the policy on one of these seeds.
         CheckpointError: An artifact of a candidate is missing or damaged, or an existing certificate is damaged.
     """
     tested = _candidates(resolved)
@@ -154,22 +154,23 @@ def charged(
 ) -> Certificate:
     """Set the error probability of a planned test, and record the policy's earlier tests.
 
-    The n-th test of a policy gets delta / 2^(n − 1). If exactly the same test (same candidates, seeds, margin and so
-    on) was run before, it does not count as a new test. It then gets the same error probability as before.
+    The n-th test of a policy gets delta / 2^(n − 1). Repeating exactly the same test (same candidates, seeds, margin,
+    delta and so on) does not count as a new test. It gets the same error probability as before, and needs no `again`.
 
     Args:
         certificate: The planned certificate. Its `delta` is the error probability of a first test.
         store: The study whose episodes are the test.
         episodes: The episodes of the test.
         paths: Folders of existing certificates. Certificates of other policies do not count.
-        again: Whether a further test of the policy is wanted.
+        again: Whether a further, different test of the policy is allowed.
 
     Returns:
         The certificate with its `earlier` tests and the `delta` of this test.
 
     Raises:
-        UsageError: The policy was tested before and `again` is not set. Or an earlier test of this policy used one of
-            these seeds. Or another study ran the policy on one of these tasks and seeds.
+        UsageError: A different test of this policy was run before and `again` is not set. Or a different earlier test
+            of this policy used one of these seeds. Or another study ran the policy on one of these tasks and seeds. A
+            repeated test raises none of these errors.
         CheckpointError: A certificate is damaged.
     """
     earlier = attempts_on(certificate.target, paths)

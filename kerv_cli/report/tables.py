@@ -55,14 +55,15 @@ _ONE_STATE = ("code", "git_commit", "device_name")
 
 @dataclass(frozen=True)
 class StudyData:
-    """A study (settings that are compared) with its stored episodes. Each table is computed once.
+    """A study (settings that are compared) with its stored episodes. Tables are computed on first use and then kept.
 
     Attributes:
         study: The settings, and the episodes that the study asks for.
         episodes: One row per stored episode (label, task, seed and repeat). Columns: those of `Study.frame`, and
             difficulty, device, number format and threads.
-        runs: One table like `episodes` per run (command). All runs used the same code on the same machine. Each run
-            measured all episodes of the study, or else all settings and tasks on its own seeds. Empty if there are
+        runs: One table like `episodes` per run. A run is one command, such as one `kerv sweep`. All runs used the same
+            code on the same kind of device. If `same_pairs` is true, each run measured all episodes of the study. If it
+            is false, each run measured all settings and tasks, on seeds that no other run used. Empty if there are
             fewer than three such runs.
         same_pairs: Whether each run measured all episodes of the study.
         against: Suffix of the names of tables and page, such as `_against_ar`, if the user chose another baseline than
@@ -226,7 +227,7 @@ def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyDa
     """Read a study and its stored episodes.
 
     Args:
-        study: The study. Only its name is used if `wanted` is None.
+        study: The study. If `wanted` is None, only its name matters: its settings and episodes are read again.
         wanted: Episodes to read. Settings without any of these episodes are left out. If None, read all episodes.
 
     Raises:
@@ -361,20 +362,21 @@ def with_matched_speed(rows: Sequence[Result]) -> list[Result]:
 
 
 def safety(row: Result) -> tuple[float, float]:
-    """Return a key for sorting settings, the safest first. The key does not depend on success.
+    """Return a key that sorts settings, the safest first. The key does not depend on success.
 
-    The setting with the smallest unverified share comes first: the share of executed tokens that the target has not
-    verified, rounded to whole per cent. Settings that decode nothing come last. Of settings with equal shares, the one
-    with the most target forwards per control step comes first.
+    The unverified share is the share of executed tokens that the target has not verified, rounded to whole per cent.
+    Settings with a smaller unverified share come first. Settings that decode nothing come last. Of settings with equal
+    shares, the one with the most target forwards per control step comes first.
     """
     unverified = row.measures.unverified_share
     return (1.0 if math.isnan(unverified) else round(unverified, 2), -row.measures.forwards_per_step)
 
 
 def passing(rows: Iterable[Result], loss: float) -> list[Result]:
-    """Test the settings in order. Return the rows before the first setting that is not shown to lose less than `loss`.
+    """Test, in order, whether each setting loses less than `loss`. Return the rows before the first failed test.
 
-    By fixed-sequence testing, all tests together have the error rate of one test.
+    A setting passes if the lower bound of its difference in success from the baseline is above −`loss`. All tests
+    together have the error rate of one test, because testing stops at the first failure (fixed-sequence testing).
 
     Args:
         rows: Rows of a table, in the order of the tests.
@@ -412,7 +414,7 @@ def flatten(settings: Plain) -> Row:
 def differences(first: Row, second: Row) -> list[Row]:
     """Return the keys whose values differ, as dictionaries with `key`, `first` and `second`.
 
-    A value is None if the key is missing there.
+    If one of the dictionaries lacks the key, its value is None.
     """
     found = []
     for key in first | second:

@@ -136,7 +136,8 @@ def attention_mask(seen: Seen, tokens: int, cache: Cache | None, like: Tensor) -
         like: Tensor whose device and number format the mask gets.
 
     Returns:
-        (T, S + T), or (T, slots) for a cache of fixed shapes. None if no mask is needed.
+        The mask (T, S + T), where S is the number of cached tokens. For a cache of fixed shapes (T, slots), where slots
+        is the number of all its slots. None if no mask is needed.
     """
     cached, fixed = (cache.length, cache.fixed) if cache is not None else (0, False)
     stop = cached + tokens

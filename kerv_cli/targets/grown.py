@@ -38,11 +38,11 @@ STD = 0.02
 
 @dataclass
 class Recipe(GrowSettings):
-    """The recipe in a grown target's folder: the shape of the new trunk, and the policy that is enlarged.
+    """The recipe in a grown target's folder: the shape of the new trunk, and the target that is enlarged.
 
     Attributes:
-        base: Folder of the policy's target.
-        sha256: Hash of the policy's weights.
+        base: Folder of the target that is enlarged.
+        sha256: Hash of that target's weights.
     """
 
     base: str = ""

@@ -116,7 +116,7 @@ def read_observations(
 def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarray:
     """Return the expert's next H actions at each of several control steps, without added noise.
 
-    A chunk that begins near the episode's end includes actions that were recorded after the success.
+    A chunk that begins near the episode's end includes actions that were recorded after the last control step.
 
     Args:
         episode: A stored episode.
@@ -127,7 +127,7 @@ def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarr
         (n, H, D) float32, environment units.
 
     Raises:
-        CheckpointError: Too few actions were recorded after the success.
+        CheckpointError: The recording holds fewer than H − 1 actions after the last control step.
     """
     check_tail(episode, chunk, f"chunks of {chunk}")
     return episode.labels[steps[:, None] + np.arange(chunk)]
@@ -202,7 +202,7 @@ def check_tail(episode: DemoEpisode, steps: int, use: str) -> None:
         use: What the actions are needed for, text for the error message.
 
     Raises:
-        CheckpointError: Too few actions were recorded after the success.
+        CheckpointError: The recording holds fewer than `steps` − 1 actions after the last control step.
     """
     tail = len(episode.labels) - episode.steps
     if tail < steps - 1:

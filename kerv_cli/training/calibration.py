@@ -264,7 +264,7 @@ def fit_boundary(
 
 
 def completed(old: stored.Calibration, new: stored.Calibration) -> stored.Calibration:
-    """Return the old calibration. Numbers that the old calibration lacks come from the new one.
+    """Return the old calibration, with the numbers of the new one added that the old one lacks.
 
     The boundary ranges are those of `new`, because `fit_boundary` has already copied the old ranges into `new`.
     """
@@ -290,21 +290,22 @@ def completed(old: stored.Calibration, new: stored.Calibration) -> stored.Calibr
 def episode_windows(episode: DemoEpisode, actions: ActionSpace, window: int, horizon: int) -> np.ndarray:
     """Cut out the expert's actions around each control step (moment) that has `window` control steps before it.
 
-    Near the end of the episode, a window also needs actions after the end. The recording holds such actions, because
-    the expert went on after the success.
+    The last moments of an episode have fewer than `horizon` actions left. The missing actions come from the end of
+    the recording, which holds further actions of the expert after the episode's last control step.
 
     Args:
         episode: A demonstration.
         actions: The action space, to normalise actions.
         window: Number of control steps before the moment.
-        horizon: Number of control steps from the moment on.
+        horizon: Number of control steps from the moment on, H.
 
     Returns:
         (n, window + horizon, D) float32: the expert's normalised actions around each of the n moments, oldest first.
         They do not include the noise that was added when the robot executed them.
 
     Raises:
-        CheckpointError: The recording holds too few actions of the expert after the episode's end.
+        CheckpointError: The recording holds fewer than H − 1 further actions of the expert after the last control step.
+            The last moment would then have fewer than H actions.
     """
     steps, length = len(episode.executed), window + horizon
     check_tail(episode, horizon, f"predictions of {horizon} steps")
@@ -333,7 +334,8 @@ def read_windows(
 
     Raises:
         KervError: A task has no episode that is longer than the window.
-        CheckpointError: A recording is damaged or holds too few actions of the expert after the episode's end.
+        CheckpointError: A recording is damaged. Or it holds fewer than H − 1 further actions of the expert after the
+            episode's last control step, so that the last moment would have fewer than H actions.
     """
     counts: dict[str, dict[str, int]] = {}
     parts, paths = [], []
@@ -427,9 +429,9 @@ class Matches:
 def match(store: Datastore, task: str, epsilon: float) -> Matches:
     """Compare each datastore entry of a task with the most similar entry of another episode (docs/methods.md §4.3).
 
-    The chunk of the most similar entry would be executed without verification. It is compared with the entry's own
-    chunk, the expert's next actions. At most ENTRIES entries are looked up. With a single episode of the
-    task there are no matches.
+    In a rollout, the chunk of the most similar entry would be executed without verification. Here it is compared with
+    the entry's own chunk, which holds the expert's next actions. At most ENTRIES entries are compared. If the task has
+    only one episode, there are no matches.
 
     Args:
         store: The datastore.
@@ -471,11 +473,14 @@ def lowest_level(matches: Matches, confidence: float, least: int = LEAST) -> flo
 def task_levels(matches: Matches, confidence: float) -> stored.SkipLevel:
     """Return a task's s_min, the smallest similarity at which verification is skipped, and its bounds.
 
-    In a rollout, feedback after each episode may move s_min between the bounds `low` and `high`. Each of the three is
-    the smallest similarity that keeps the share of wrong chunks within a limit. With a confidence of 0.9 the limits are
-    0.1 for s_min, 0.2 (twice as much) for `low`, and 0.033 (a third) for `high`. If no similarity keeps the limit of
-    `high`, `high` is the largest similarity of all matches. If no similarity keeps the limit of s_min, all three
-    are NEVER, and the task never skips.
+    In a rollout, a skip rule may lower s_min after a success and raise it after a failure, between the bounds `low` and
+    `high`. Each of these three numbers (`low`, s_min, `high`) is a similarity with its own limit on wrong chunks. It is
+    the smallest similarity for which the share of wrong chunks, among the matches that reach it, is within the limit.
+    At least LEAST matches must reach it. With a confidence of 0.9 the limits are 0.1 for s_min, 0.2 (twice as much) for
+    `low`, and 0.033 (a third) for `high`.
+
+    If no similarity is within the limit for `high`, then `high` is the largest similarity of all matches. If no
+    similarity is within the limit for s_min, all three numbers are NEVER, and the task never skips verification.
 
     Args:
         matches: The task's matches.

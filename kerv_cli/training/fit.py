@@ -216,7 +216,7 @@ class State:
 
 
 def text_of(metrics: Metrics) -> str:
-    """Return the first metrics as text for a progress bar."""
+    """Return the first few metrics (at most six, without the step) as text for a progress bar."""
     first = list(metrics.items())[:6]
     return " ".join(f"{name} {value:.4g}" for name, value in first if name != "step")
 

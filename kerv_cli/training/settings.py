@@ -91,8 +91,8 @@ class TrainTargetSettings(TaskSettings):
 class DemosSettings(MethodSettings, TaskSettings):
     """Settings of `kerv demos`, which records demonstrations.
 
-    `policy` acts in the environment. The default is the scripted expert. Any other policy visits its own states, and
-    the expert labels them (DAgger).
+    `policy` acts in the environment. The default is the scripted expert. If another policy acts, the expert labels the
+    states that this policy visits (DAgger).
     """
 
     groups: ClassVar = {"policy": "expert", "world": "default", "runtime": "workers", "method": "ar"}
@@ -156,7 +156,7 @@ class PrepareSettings(DemonstrationSettings):
 class BuildDrafterSettings(RunSettings):
     """Settings of `kerv build drafter`, which imports a published EAGLE or Spec-VLA drafter.
 
-    `policy.artifacts.drafter` names the imported drafter.
+    The setting `policy.artifacts.drafter` gives the name under which the imported drafter is stored.
     """
 
     groups: ClassVar = {"policy": "vision", "runtime": "cpu"}

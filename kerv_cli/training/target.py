@@ -143,15 +143,19 @@ def refuse_contradictions(settings: TrainTargetSettings) -> None:
 
 
 def settle_places(settings: TrainTargetSettings, dataset: DemoDataset) -> None:
-    """Check that the demonstrations hold the positions that the policy reads or learns to estimate.
+    """Choose the positions that the policy learns to estimate, and check that the demonstrations hold them.
 
-    If the demonstrations hold no object positions, `train.places` changes from `state` to `path`, and a line on stderr
-    says so. The policy then learns to estimate where the hand will be.
+    A policy with `target.observation=state` reads object positions as input, so the demonstrations must hold them. A
+    policy with `target.observation=vision` learns to estimate positions. If the demonstrations hold no object
+    positions, this function changes `train.places` from `state` to `path`, and says so on stderr. The policy then
+    learns to estimate where the hand will be.
 
     Raises:
-        UsageError: The policy reads object positions, and the demonstrations hold none. Or `train.places=path` is
-            chosen but a policy acted in some demonstrations. Or a setting needs images and the policy has none.
-        CheckpointError: The demonstrations hold neither the objects' positions nor the hand's.
+        UsageError: The policy reads object positions as input, and the demonstrations hold none. Or a setting needs
+            images, and the policy reads none. Or `train.places` is `path` and `train.scene_weight` is above 0, but a
+            policy moved the robot in some demonstrations. The hand's path is then not the expert's.
+        CheckpointError: The demonstrations hold neither object positions nor the hand's position, so the policy has no
+            positions to estimate.
     """
     train, manifest = settings.train, dataset.manifest
     where = f"the demonstrations in {dataset.path}"

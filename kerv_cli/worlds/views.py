@@ -33,7 +33,8 @@ def views_of(name: str) -> list[View]:
     """Parse a camera's name into its views, from left to right.
 
     Args:
-        name: Views joined by `+`. An empty name means one view of the environment's first camera.
+        name: One or more views joined by `+`. A view is NAME or NAME:DEGREES, where DEGREES is its vertical field of
+            view. An empty name means one view of the environment's first camera.
 
     Raises:
         UsageError: A view has no camera or an impossible field of view.

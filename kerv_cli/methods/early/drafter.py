@@ -264,7 +264,10 @@ class EarlyDrafter(TrainableDrafter):
     def decoded(
         self, target: Any, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace, columns: dict[str, Tensor]
     ) -> Decodes:
-        """Decode observations of an episode. Keep only pooled prompts, because whole prompts would fill the memory."""
+        """Decode observations of an episode. Keep only pooled prompts, because whole prompts would fill the memory.
+
+        `TrainableDrafter.decoded` explains the arguments.
+        """
         prompts = list(prompts_of(target, observations_of(target, episode, steps, space)))
         features = torch.cat([target.pooled(prompt).half().cpu() for prompt in prompts])
         tokens = torch.cat([greedy(target, prompt)[0].cpu() for prompt in prompts])
@@ -520,6 +523,7 @@ class ScoutDrafter(EarlyDrafter):
         """Let the target decode observations of an episode, and return them as training examples.
 
         An example's labels are the target's tokens, and the target's estimates of the positions of object and goal.
+        `TrainableDrafter.decoded` explains the arguments.
 
         Raises:
             CheckpointError: The target has no camera, or the images have another size than the target takes.

@@ -77,7 +77,7 @@ class ExactIndex(Index):
     """datastore=exact, the default: compare the key with all entries of the task, in this process."""
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return the k most similar rows. Also return every other row that rounding errors may have kept out of them.
+        """Return the k most similar rows. Also return rows that may be among them if rounding errors are considered.
 
         `Index.candidates` explains the arguments.
         """
@@ -184,12 +184,12 @@ class HybridProposer(Proposer):
 
     @classmethod
     def build(cls, settings: HybridProposerSettings, context: Context) -> HybridProposer:
-        """Build the hybrid proposer, which `proposer=hybrid` chooses."""
+        """Build the drafter's proposer and the retrieval proposer, and join them (`proposer=hybrid`)."""
         drafter = registry.ProposerPart.find("drafter").built(settings, context)
         return cls(drafter, RetrievalProposer(settings, context))
 
     def begin(self, chunk: Chunk) -> None:
-        """Select the proposer that the boundary chose for this chunk, and let it begin the chunk."""
+        """Select retrieval or the drafter for this chunk, as the boundary decided, and call the proposer's `begin`."""
         assert chunk.choice is not None, "a hybrid proposer needs a boundary"
         self.chosen = self.proposers[chunk.choice.mode]
         self.name = self.chosen.name
@@ -240,7 +240,7 @@ class GroupRule(DistanceRule):
 
     @classmethod
     def build(cls, settings: SequenceAcceptanceSettings, context: Context) -> GroupRule:
-        """Build the part that the setting `acceptance=sequence` chooses."""
+        """Build the rule for the target's action space (`acceptance=sequence`)."""
         return cls(context.target.actions, settings.group_limit, settings.token_limit)
 
     def limits(self, r: int) -> tuple[int, ...]:
@@ -274,7 +274,10 @@ class HybridAcceptanceSettings(SequenceAcceptanceSettings):
 @registry.AcceptancePart("hybrid", HybridAcceptanceSettings)
 @dataclass(frozen=True, kw_only=True)
 class HybridRule(RelaxedRule):
-    """Judges retrieved drafts by kinematic group, and all other drafts token by token, by the radius r.
+    """Uses two rules: one for retrieved drafts, and one for all other drafts.
+
+    In a retrieved draft, each kinematic group (position, rotation, gripper) is accepted or rejected as a whole
+    (`GroupRule`). In any other draft, each token is accepted if it is within the radius r (`RelaxedRule`).
 
     Attributes:
         retrieved: The rule for retrieved drafts.
@@ -284,7 +287,7 @@ class HybridRule(RelaxedRule):
 
     @classmethod
     def build(cls, settings: HybridAcceptanceSettings, context: Context) -> HybridRule:
-        """Build the part that the setting `acceptance=hybrid` chooses."""
+        """Build both rules for the target's action space (`acceptance=hybrid`)."""
         return cls(context.target.actions, settings.strict_dofs, retrieved=GroupRule.build(settings, context))
 
     def of_drafts_from(self, proposer: str) -> DistanceRule:
@@ -335,7 +338,7 @@ class Always(Boundary):
     """Makes the same choice for every chunk: boundary=always_retrieval or boundary=always_drafter."""
 
     def choose(self, path: np.ndarray) -> Choice:
-        """Choose the proposer that the boundary's name says: retrieval or the drafter. The hand's path is not used."""
+        """Choose retrieval for `always_retrieval`, the drafter for `always_drafter`. The hand's path is not used."""
         return Choice(self.settings.kind.removeprefix("always_"))
 
 
@@ -441,7 +444,7 @@ class VerifySkip(Skip):
 
     @classmethod
     def build(cls, settings: SimilaritySkipSettings, context: Context) -> VerifySkip:
-        """Build the part that the setting `skip=similarity` chooses.
+        """Build the skip rule, with s_min from the settings or else from the calibration (`skip=similarity`).
 
         If the method's proposer also retrieves, the skip rule uses that proposer's search instead of a second search.
         """

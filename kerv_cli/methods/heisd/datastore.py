@@ -330,11 +330,12 @@ def neighbour_tree(
     """Merge the neighbours' chunks into one tree of kinematic groups (docs/methods.md §4.2).
 
     A kinematic group is the position, rotation or gripper tokens of one control step. Every path of the tree consists
-    of whole groups. After a group, a path may continue with the next group of any neighbour. There is one exception: a
-    group of strict DoFs (the gripper) must come from a neighbour that also has the group before it.
+    of whole groups. After a group, a path may continue with the next group of any neighbour. There is one exception: if
+    the next group is strict (the gripper), it must come from a neighbour whose chunk also contains the path's last
+    group.
 
-    If the tree would be too large, the most probable groups are kept (*ours*). The i-th neighbour has the weight 1 / i,
-    and a path changes to another neighbour with probability `cross`.
+    If the tree would be too large, only the most probable groups are kept (our addition to the paper). The i-th
+    neighbour has the weight 1 / i, and a path changes to another neighbour with probability `cross`.
 
     Args:
         chunks: (k, N) tokens, most similar neighbour first.
@@ -369,7 +370,8 @@ def neighbour_tree(
             parent: Last node of the path.
             level: Number of groups on the path.
             last: Bit set of the neighbours whose chunks have the last group of the path.
-            whole: Bit set of the neighbours whose chunks have all groups of the path. Equal to `last` if there is none.
+            whole: Bit set of the neighbours whose chunks have all groups of the path. If no chunk has all of them, it
+                is a bit set of neighbours whose chunks have the path's groups since it last changed neighbours.
             cost: −log probability of the path.
         """
         strict, givers = levels[level] if level < len(levels) else (False, [])

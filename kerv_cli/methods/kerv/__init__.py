@@ -146,7 +146,7 @@ class Compensation(Rectifier):
 
     @classmethod
     def build(cls, settings: CompensateSettings, context: Context) -> Compensation:
-        """Build the part that the setting `rectifier=compensate` chooses."""
+        """Build the rectifier with the predictor that the settings name (`rectifier=compensate`)."""
         name = "hold" if settings.predictor == DRAFT else settings.predictor
         predictor = find_predictor(name).predictor(context)
         return cls(settings, predictor if settings.hold_strict else predictor.released())
@@ -239,9 +239,9 @@ class KinematicThresholdSettings(RadiusRange):
 
 @dataclass
 class ScheduleThresholdSettings(RadiusRange):
-    """KERV's public code: the radius falls with the number t of decodes in the episode: 3 + 12 exp(−(t / τ)³).
+    """KERV's public code: the acceptance radius falls with the number t of decodes in the episode.
 
-    The motion is not used.
+    r(t) = r_min + (r_max − r_min) · exp(−(t / τ)^φ). The robot's motion does not change r.
     """
 
     kind: str = "schedule"
@@ -324,7 +324,7 @@ for _kind in ("kinematic", "change", "offset", "quoted"):
 
 @ThresholdPart("schedule", ScheduleThresholdSettings, radius="r_max")
 class Schedule(Threshold):
-    """The acceptance radius falls with the number t of decodes in the episode. The motion is not used.
+    """The acceptance radius falls with the number t of decodes in the episode. The robot's motion does not change it.
 
     r(t) = r_min + (r_max − r_min) · exp(−(t / τ)^φ). The default settings are those of KERV's public code:
     r(t) = 3 + 12 · exp(−(t / 20)³).

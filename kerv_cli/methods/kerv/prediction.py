@@ -55,7 +55,7 @@ def filter_state(ratio: float, window: int, damping: float) -> tuple[np.ndarray,
     r · I. For each further action the filter predicts and updates once.
 
     Args:
-        ratio: q / r, process noise by measurement noise.
+        ratio: q / r, process noise divided by measurement noise.
         window: Number of actions.
         damping: Factor of the velocity per control step.
 
@@ -83,7 +83,7 @@ def filter_state(ratio: float, window: int, damping: float) -> tuple[np.ndarray,
 def kalman_weights(q: float, r: float, window: int, horizon: int, damping: float = 1.0) -> np.ndarray:
     """Return the weights (horizon, window) of the past actions in a Kalman filter's predictions for one DoF.
 
-    Row h − 1 times the last `window` actions (oldest first) is the prediction h control steps ahead.
+    The prediction h control steps ahead is the dot product of row h − 1 and the last `window` actions (oldest first).
 
     Args:
         q: Process noise.
@@ -139,8 +139,8 @@ class Predictor:
     def weights(self, dof: int, window: int) -> np.ndarray:
         """Return the weights (horizon, window) of the past actions in the predictions for one DoF.
 
-        Row h − 1 times the past actions (oldest first) is the prediction h control steps ahead. In this base class,
-        only the newest action has a weight other than 0.
+        The prediction h control steps ahead is the dot product of row h − 1 and the past actions (oldest first). In
+        this base class, only the newest action has a weight other than 0.
 
         Args:
             dof: Index of the DoF.
@@ -209,14 +209,14 @@ class Kalman(Predictor):
     name = "kalman"
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return the filter's prediction as weights on the last `window` actions, (horizon, window)."""
+        """Return the weights (horizon, window) of the last `window` actions in the filter's predictions for one DoF."""
         assert self.noise is not None
         q, r, damping = self.noise.q[dof], self.noise.r[dof], self.noise.damping[dof]
         return kalman_weights(q, r, window, self.horizon, damping)
 
 
 class Damped(Kalman):
-    """A Kalman filter whose velocity fades (*ours*). Actions are bounded, so no velocity can last."""
+    """A Kalman filter whose velocity fades (not in the paper). Actions are bounded, so no velocity can last."""
 
     name = "damped"
 
@@ -301,9 +301,9 @@ def assemble(
 ) -> np.ndarray | None:
     """Assemble the actions of a compensated chunk: known tokens, then drafted tokens, then predictions.
 
-    `settings.steps` control steps are filled, beginning with the first step that is not completely known. That first
-    step is left out, and one step fewer is filled, if fewer than `min_verified` of its DoFs are known. It is also left
-    out if none of its DoFs is known and the setting `drop` is true. The first step of the chunk is never left out.
+    `settings.steps` control steps are filled, beginning with the first step that is not completely known. One step
+    fewer is filled if fewer than `min_verified` DoFs of that first step are known. One step fewer is also filled if
+    none of them is known and the setting `drop` is true. Neither rule applies to the first control step of the chunk.
 
     Args:
         tokens: Known tokens of the chunk: accepted draft tokens and tokens of the target.

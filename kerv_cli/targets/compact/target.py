@@ -81,7 +81,7 @@ class CompactTarget(Compilable):
         camera: Name of the camera. Names that are joined with `+` stand for one image of several camera views.
 
     Attributes:
-        cameras: One name: the camera whose images are read. Empty if the policy reads the state.
+        cameras: A tuple with one name, the camera whose images are read. Empty if the policy reads the state.
         frame_shape: Shape (height, width, 3) of an image.
         segments: Slice of prompt positions that each part of the prompt takes, by the part's name.
         max_prompt: P, number of prompt tokens. It is the same for every observation and instruction.
@@ -91,8 +91,8 @@ class CompactTarget(Compilable):
         parallel: Whether the policy decodes all tokens in one forward (`parallel_pass`). It then cannot decode single
             tokens.
         width: E, width of the embeddings and hidden states.
-        heads: Number of attention heads of a layer, also in a drafter's layers.
-        feed_forward: Number of hidden units of a layer, also in a drafter's layers.
+        heads: Number of attention heads per layer. The layers of a drafter have as many.
+        feed_forward: Number of hidden units per layer. The layers of a drafter have as many.
         enlarges: Function that enlarges a drafter in place, as this target was enlarged (docs/methods.md §0.2). None if
             drafters stay as they are.
         hand_and_object: Positions (3,) in metres of the hand and the object in the last observation that `encode` read.
@@ -146,11 +146,14 @@ class CompactTarget(Compilable):
 
     @property
     def encoders(self) -> tuple[VisionEncoder, ...]:
-        """The encoders of a vision policy, one per camera view from left to right."""
+        """The encoders of a vision policy, one per camera view. Their order is that of the views in the image.
+
+        The views lie side by side in the image. The first encoder reads the leftmost view.
+        """
         return self.vision, *self.further_views
 
     def pooled(self, prompt: Tensor) -> Tensor:
-        """Pool prompts (B, P, E) into fixed vectors (B, F).
+        """Summarise each prompt of P tokens (B, P, E) as one vector of F numbers (B, F).
 
         A vector holds the scene tokens, the proprioception token, the mean of the word tokens, and for a vision policy
         the mean of the vision tokens.

@@ -51,8 +51,9 @@ class DemoEpisode:
             iterator of images instead.
         frame_steps: (n,) int64. Image i was drawn before the action of control step `frame_steps[i]`.
         states: (T, s) float32, privileged state before each action. It begins with the proprioception.
-        labels: (T + tail, D) float32, the expert's actions for D DoFs, clipped and without noise. The expert executed
-            the last `tail` actions after the episode's end.
+        labels: (T + tail, D) float32, the expert's actions for D DoFs, clipped and without noise. The last `tail`
+            actions come after the episode's end. The expert executed them. In imported data, they are copies of the
+            last recorded action.
         executed: (T, D) float32, the actions that moved the robot.
         initial_state: (k,) float64, the world's `initial_state`, such as the placement of object and goal.
     """

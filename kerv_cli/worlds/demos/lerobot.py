@@ -75,7 +75,7 @@ class Source:
         tasks: The instructions by `task_index`, the number of a task.
         camera: Name of the camera to read.
         key: Name of the feature with the camera's images.
-        taken: Bytes in memory that the images read from each file so far take.
+        taken: For each file, the size in memory of all images that have been read from it so far, in bytes.
     """
 
     folder: Path
@@ -192,8 +192,8 @@ class Source:
             table: The episode's rows.
 
         Raises:
-            CheckpointError: A file is missing or damaged. Or the images read from it so far, also for earlier episodes,
-                take more memory than its size allows.
+            CheckpointError: A file is missing or damaged. Or its images take more memory than its size allows. The
+                images of earlier episodes in the same file count, too.
         """
         count = len(table)
         if self.info["features"][self.key]["dtype"] == "image":
@@ -407,7 +407,8 @@ def action_space(source: Source, settings: DemosImportSettings, actions: np.ndar
     Args:
         source: The dataset.
         settings: Settings of `kerv demos import`: names of the DoFs, and strict DoFs (such as a gripper).
-        actions: (n, D) recorded actions, among them the smallest and the largest value of each DoF.
+        actions: (n, D) recorded actions. They may be a selection of all recorded actions, but must contain the smallest
+            and the largest value of each DoF.
 
     Raises:
         UsageError: `dofs=openvla` was chosen, but the actions do not have seven DoFs.
