@@ -185,9 +185,10 @@ class Estimate:
 
 
 def closest(tokens: int, family: Family) -> Recorded | None:
-    """Return a setting from results/tables that has a family's method and its kind of draft (chain or tree).
+    """Return a measured setting from results/tables for a family: same method, and same kind of draft (chain or tree).
 
-    The table whose chunk length is closest to `tokens` tokens is searched first. None if no table has such a setting.
+    Tables are searched in order, those with a chunk length close to `tokens` tokens first. None if no table has such a
+    setting.
     """
     for table in nearest_tables(tokens):
         for one in recorded(table):

@@ -229,8 +229,8 @@ def _rows_of_turn(
 ) -> dict[Episode, StoredEpisode]:
     """Choose one stored row for each episode of a turn (see `_turns`). Episodes without a row are left out.
 
-    If an episode has several rows, choose the row of the block that ran most episodes of the turn. If several blocks
-    ran equally many, choose the newest row.
+    If an episode has several rows, choose the row from the block that ran the most episodes of the turn. If several
+    blocks ran equally many, choose the newest row.
     """
     in_block: Counter[str] = Counter()
     for one in turn:
@@ -325,10 +325,11 @@ def _keep_whole_orders(usable: dict[Episode, list[StoredEpisode]], block: int) -
 def blocks_of(episodes: Iterable[Episode], block: int, workers: int = 1) -> list[Block]:
     """Group episodes into blocks, each to be run by one process.
 
-    A block holds one task, one repeat, one number of threads, and up to `block` successive seeds, for which the same
-    settings must run. If different settings must run for some seeds, those seeds get a block of their own. But if a
-    setting's results depend on the order of its seeds, its seeds are never split. Episodes that run as a batch are
-    grouped by setting instead, into blocks small enough that every worker gets one.
+    The episodes of a block have the same task, the same repeat and the same number of threads. They have up to `block`
+    successive seeds. All seeds of a block run the same settings: seeds for which other settings must run get a block of
+    their own. But if a setting's results depend on the order of its seeds, its seeds are never split.
+
+    Episodes that run as a batch are grouped by setting instead, into blocks small enough that every worker gets one.
 
     Args:
         episodes: The episodes to run.

@@ -275,8 +275,8 @@ class Queue:
     def fill(self) -> None:
         """Write the planned study and its blocks, in one transaction.
 
-        Blocks of the same tasks that an earlier command has planned are removed, unless that command or a worker still
-        runs them.
+        Blocks of this study that an earlier command has planned are removed if the new plan has all their tasks. They
+        stay if that command is still running, or if a worker runs them.
         """
         study = self.study
         about = {"executor": study.runtime.executor, "workers": study.runtime.workers}
@@ -439,10 +439,10 @@ class Queue:
                     connection.execute(freed.values(worker=None, heartbeat=None, running=None))
 
     def left(self) -> tuple[int, int]:
-        """Return the number of blocks that have not ended, and how many of these this worker could claim now.
+        """Return the number of blocks that have not ended, and how many of these are free for this worker.
 
-        This worker can claim a block unless another worker has claimed it and still writes heartbeats. This method only
-        reads the database, so no worker has to wait for it.
+        A block is free unless another worker has claimed it and still writes heartbeats. This method only reads the
+        database, so no worker has to wait for it.
         """
         with self.database.reading() as connection:
             is_open = sa.case((self._is_open(connection), 1), else_=0)

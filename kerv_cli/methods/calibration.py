@@ -100,7 +100,7 @@ class SkipLevel:
 
 @dataclass(frozen=True)
 class SkipSection:
-    """The similarities from which on verification is skipped, for one datastore.
+    """How similar a stored observation must be so that verification is skipped, for one datastore.
 
     To measure them, entries of the datastore were compared with their neighbours. An entry's neighbour is the most
     similar entry of another episode.

@@ -82,9 +82,9 @@ class StreakSkipSettings:
 class StreakSkip(Skip):
     """Executes drafts without verification, as long as verified drafts agree with the target.
 
-    After the first verified chunk that agrees with its draft, 1 decode is not verified. Each further agreement doubles
-    this number, up to the setting `most`. A chunk that does not agree with its draft resets the number to 0. The
-    setting `opening` is the number of decodes without verification at the start of an episode.
+    After the first verified chunk that agrees with its draft, the next decode is not verified. Each further agreement
+    doubles the number of unverified decodes that follow, up to the setting `most`. A chunk that does not agree with its
+    draft resets the number to 0. An episode starts with `opening` decodes without verification.
 
     Attributes:
         source: The proposer of the drafts.

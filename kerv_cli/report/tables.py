@@ -195,7 +195,8 @@ class StudyData:
 def references_of(settings: Sequence[Setting], baseline: str) -> dict[str, str]:
     """Return for each setting's label the label of the setting that it is compared with.
 
-    A setting is compared with the baseline's method under the same stress and clock, if the study has such a setting.
+    The baseline's method may run several times in a study, under different conditions (stress and `rollout.*`, such as
+    the clock). A setting is compared with the baseline's method under its own conditions, if the study has that.
     Otherwise the setting is compared with the study's baseline.
 
     Args:
@@ -335,10 +336,11 @@ def _results(data: StudyData, averaging: str) -> list[Result]:
 def with_matched_speed(rows: Sequence[Result]) -> list[Result]:
     """Add the matched-success speed: one number per method and baseline, the same in each of the method's rows.
 
-    How fast is a method at its fastest setting that keeps success (docs/methods.md §7)? The measure is from
-    WA-SpecDec, arXiv 2608.08725. It is the largest `episode_speedup` of the method's settings that pass the test of
-    success with a margin of 3 points. It is missing if no setting passes, or if the settings that pass were not timed.
-    It is also missing for the baseline itself, and if the baseline does not solve the tasks.
+    It says how fast a method is at its fastest setting that keeps success (docs/methods.md §7; from WA-SpecDec,
+    arXiv 2608.08725). Settings are tested in order of `safety`, with a margin of 3 points, until one fails (`passing`).
+    The settings before it keep success. The matched-success speed is the largest `episode_speedup` of these
+    settings. It is missing if no setting passes, or if the settings that pass were not timed. It is also missing for
+    the baseline itself, and if the baseline does not solve the tasks.
 
     Args:
         rows: One row per setting and task, or per setting and way of averaging.

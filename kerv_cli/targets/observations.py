@@ -39,7 +39,7 @@ class Rows:
         return next(len(x) for x in vars(self).values() if x is not None)
 
     def where(self, chosen: Tensor) -> Self:
-        """Return the rows that a boolean mask (n,) or indices select."""
+        """Return the rows that `chosen` selects: a boolean mask (n,), or indices of rows."""
         return type(self)(*(None if x is None else x[chosen] for x in vars(self).values()))
 
     @classmethod
@@ -95,7 +95,7 @@ def read_observations(
             Otherwise every control step is one.
         space: Observation space of the demonstrations.
         words: The policy's vocabulary.
-        chosen: Which of these observations to return, as indices or a slice.
+        chosen: Which of these observations to return, as indices among them or as a slice.
 
     Raises:
         CheckpointError: The images have a different size than the policy takes.

@@ -57,9 +57,10 @@ class BoundaryRanges:
         radius_high: 95th percentile of R.
         length_low: Minimum of D.
         length_high: 95th percentile of D.
-        points: Scaled R and scaled D, in [0, 1], of a hundred windows (sections of the paths). These windows are evenly
-            spaced in the list of all windows sorted by scaled R + scaled D. They give the quantiles of F, the weighted
-            sum of scaled R and scaled D. Empty in calibrations before version 1.1.
+        points: A hundred pairs (scaled R, scaled D), each in [0, 1], one pair per window (section of a path). To choose
+            the windows, all windows are sorted by scaled R + scaled D, and a hundred are taken at even spacing. The
+            pairs give the quantiles of F, the weighted sum of scaled R and scaled D. Empty in calibrations before
+            version 1.1.
 
     Raises:
         CheckpointError: A range is empty or not finite.
