@@ -177,6 +177,21 @@ def test_the_remedy_for_weights_of_another_target_works_as_it_is_typed(results):
 
 
 @pytest.mark.usefixtures("quick_training")
+def test_a_calibration_for_another_datastore_is_refused_by_a_plan_and_made_again(results):
+    told("prepare", MINE, "for=heisd", "steps=2")
+    rollout = ("rollout", "method=heisd", "task=reach", MINE, "--plan")
+    assert "1 task, " in told(*rollout)
+    shutil.rmtree(results / "artifacts/datastore/mine")
+    told("build", "datastore", MINE, "components=4")
+    (remedy,) = typed(told(*rollout, code=1))
+    assert remedy == ["calibrate", MINE]
+    assert "of other artifacts" in told("prepare", MINE, "--plan")
+    told(*remedy)
+    assert "1 task, " in told(*rollout)
+    assert "of other artifacts" not in told("prepare", MINE, "--plan")
+
+
+@pytest.mark.usefixtures("quick_training")
 def test_an_artifact_has_a_row_and_is_shown_with_the_settings_that_it_was_made_with(results):
     quick = ["demos=few", "task=[reach-v3]", "train.steps=2", "train.batch=2", "train.validate_every=1"]
     made = {

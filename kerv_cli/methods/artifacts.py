@@ -319,12 +319,21 @@ class Artifacts:
             hashes[kind] = files.digest(path, description)
             todo += files.needs(description)
             what = f"the {files.noun} in {path} was {files.made}"
-            sources.append((files.sources(description), what, files.anew(path)))
+            sources.append((files.sources(description), what, self._again(files, path)))
             if use is not None:
                 files.check_use(description, use)
         for hashes_of_sources, what, again in sources:
             check_sources(hashes_of_sources, hashes, what, again)
         return hashes
+
+    def _again(self, files: Artifact[Any], path: Path) -> str:
+        """Return advice for an error message: how to replace the artifact in `path`, with all words of the command."""
+        words = [f"policy.target={self.policy.target}"]
+        for kind, name in self.policy.artifacts.items():
+            if name:
+                words.append(f"policy.artifacts.{kind}={name}")
+        command = files.anew(path).removesuffix("'")
+        return f"{command} {' '.join(words)}'"
 
     def _making(self, files: Artifact[Any]) -> str:
         """Return the command that makes a missing artifact."""

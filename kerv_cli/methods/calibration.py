@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -237,6 +237,10 @@ class CalibrationArtifact(Artifact[Calibration]):
     def json(self, path: Path) -> Path:
         """Return `path`, because a calibration is its own description."""
         return path
+
+    def sources(self, description: Calibration) -> Mapping[str, str]:
+        """Return the hash of the datastore that the skip levels were measured for. Empty if there are none."""
+        return {"datastore": description.skip.datastore} if description.skip else {}
 
     def check_use(self, description: Calibration, use: Use) -> None:
         """Refuse a method whose parts need numbers that were not measured.

@@ -99,13 +99,14 @@ def calibrate(
     method = Method.of(RolloutSettings(**{kind: find(kind, name).default for kind, name in DRAFTS.items()}))
     method.check(target)
     missing = [kind for kind in ("drafter", "datastore") if not artifacts.exists(kind)]
-    if "datastore" not in missing:
-        artifacts.check(["datastore"])
+    hashes = artifacts.check({"datastore"} - set(missing))
     old: stored.Calibration | None = artifacts.load("calibration") if settings.complete else None
-    # a shipped calibration may be completed, and skip levels may be added to it
+    # a shipped calibration may be completed, and it may get skip levels for a datastore that the user has built
     path = artifacts.path("calibration")
-    lacks_skip = "datastore" not in missing and path.is_file() and read_mapping(path).get("skip") is None
-    artifacts.new("calibration", adds=old is not None or lacks_skip)
+    known = read_mapping(path).get("skip") if path.is_file() else None
+    is_named = bool(settings.policy.artifacts.get("datastore"))
+    fits = isinstance(known, dict) and (is_named or known.get("datastore") == hashes.get("datastore"))
+    artifacts.new("calibration", adds=old is not None or ("datastore" in hashes and not fits))
     without = f"; without {' and '.join(missing)}" if missing else ""
     plan = (
         f"predictors fitted on {count(len(chosen), 'demonstration')} of {count(len(tasks), 'task')}; "
