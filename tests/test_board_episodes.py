@@ -253,7 +253,8 @@ def test_a_person_gets_from_a_failure_to_its_film_a_decode_and_rerun(page, addre
     expect(page.locator("#decode")).to_contain_text("Decode 1 at step 4")
     page.get_by_role("button", name="play").click()
     expect(output).to_have_text("step 12")
-    assert image.evaluate("image => image.complete && image.naturalWidth") == 240
+    # the next frame may still be loading
+    page.wait_for_function("image => image.complete && image.naturalWidth === 240", arg=image.element_handle())
 
     link = page.get_by_role("link", name="Open in Rerun")
     recording = parse_qs(urlsplit(link.get_attribute("href")).query)["url"]
