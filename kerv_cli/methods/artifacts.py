@@ -109,6 +109,7 @@ class Artifact(Generic[T]):
         noun: Name of the kind in messages, such as `early drafter`.
         made: Word that messages use for how such an artifact was made, such as `trained`.
         command: Command-line arguments after `kerv` that make such an artifact. Empty if no command makes it.
+        advice: Words that messages write before this command.
         schema: Dataclass with the fields of the JSON file.
     """
 
@@ -116,16 +117,21 @@ class Artifact(Generic[T]):
     noun: str
     made = "trained"
     command: tuple[str, ...] = ()
+    advice = "run"
     schema: type[T]
 
-    @property
-    def again(self) -> str:
-        """Part of error messages that says how to make such an artifact."""
-        return f"run 'kerv {' '.join(self.command)}'"
+    def again(self, *words: str) -> str:
+        """Return advice for an error message: how to make such an artifact. `words` are further arguments."""
+        return f"{self.advice} 'kerv {' '.join((*self.command, *words))}'"
 
-    def anew(self, path: Path) -> str:
-        """Return advice for an error message: how to replace the artifact in `path`, made for another target."""
-        return self.again
+    def anew(self, path: Path, *words: str) -> str:
+        """Return advice for an error message: how to replace the artifact in `path`, made for another target.
+
+        Args:
+            path: Path of the artifact.
+            words: Further arguments of the command that makes the artifact.
+        """
+        return self.again(*words)
 
     def path(self, results: str, name: str | None, target: Path) -> Path:
         """Return the path of an artifact.
@@ -195,7 +201,7 @@ class Artifact(Generic[T]):
         """
         file = self.json(path)
         if not file.is_file():
-            raise CheckpointError(f"no {self.noun} in {path}: {self.again}, or name a folder that holds one")
+            raise CheckpointError(f"no {self.noun} in {path}: {self.again()}, or name a folder that holds one")
         return self.described(file)
 
     def described(self, file: Path) -> T:
@@ -208,8 +214,8 @@ class Artifact(Generic[T]):
         try:
             description = read_file(self.schema, file)
         except CheckpointError as error:
-            raise CheckpointError(f"{error}; {self.again}") from error
-        check_files(file.parent, getattr(description, "files", {}), self.again)
+            raise CheckpointError(f"{error}; {self.again()}") from error
+        check_files(file.parent, getattr(description, "files", {}), self.again())
         return description
 
     def checked(self, path: Path, target: TargetDescription) -> T:
@@ -332,8 +338,7 @@ class Artifacts:
         for kind, name in self.policy.artifacts.items():
             if name:
                 words.append(f"policy.artifacts.{kind}={name}")
-        command = files.anew(path).removesuffix("'")
-        return f"{command} {' '.join(words)}'"
+        return files.anew(path, *words)
 
     def _making(self, files: Artifact[Any]) -> str:
         """Return the command that makes a missing artifact."""

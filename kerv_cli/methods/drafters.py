@@ -176,12 +176,16 @@ class TrainableDrafter(Artifact[DrafterDescription]):
             context: The context in which the method is built.
         """
 
-    def anew(self, path: Path) -> str:
+    def anew(self, path: Path, *words: str) -> str:
         """Return advice for an error message: how to replace the drafter in `path`, trained for another target.
 
         The user must remove the old drafter first, because a training can only be resumed for its own target.
+
+        Args:
+            path: Folder of the drafter.
+            words: Further arguments of the command that trains a drafter.
         """
-        return f"{removal(self.kind, path)}, then {self.again}"
+        return f"{removal(self.kind, path)}, then {self.again(*words)}"
 
     def load(self, path: Path, artifacts: Artifacts) -> Any:
         """Load the network with frozen weights, on the target's device and in the target's number format."""

@@ -43,7 +43,6 @@ from kerv_cli.worlds import spec_of
 VECTORS, PAYLOAD, PROJECTION = "vectors.npy", "payload.parquet", "projection.npy"
 CROSS = 0.1  # assumed probability that a path of retrieved groups changes to another neighbour after a group
 COLUMNS = {"seeds": "seed", "steps": "step", "left": "left"}
-AGAIN = "build one with 'kerv build datastore'"
 
 
 @dataclass(frozen=True)
@@ -290,7 +289,7 @@ class DatastoreArtifact(Artifact[Manifest]):
     """Finds, checks and loads datastores. A datastore is a folder with demonstrated chunks, which `Datastore` opens."""
 
     kind = noun = "datastore"
-    made, command, again = "built", ("build", "datastore"), AGAIN
+    made, command, advice = "built", ("build", "datastore"), "build one with"
     schema = Manifest
 
     def json(self, path: Path) -> Path:
