@@ -225,11 +225,6 @@ class Recorded:
     speed: float
 
 
-def nearest_tables(tokens: int) -> list[str]:
-    """Return the names of the published tables, sorted by the distance of their chunk length from `tokens` tokens."""
-    return sorted(TABLES, key=lambda name: abs(TABLES[name] - tokens))
-
-
 @functools.cache
 def recorded(table: str) -> list[Recorded]:
     """Return the settings of a published table, AR first.

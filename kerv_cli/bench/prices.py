@@ -12,7 +12,7 @@ from functools import cached_property
 from typing import Any
 
 from kerv_cli.bench.described import Described
-from kerv_cli.bench.expected import Decodes, Drafts, Recorded, nearest_tables, recorded
+from kerv_cli.bench.expected import TABLES, Decodes, Drafts, Recorded, recorded
 from kerv_cli.bench.physics import DEVICES, ENGINES, ROOFLINE, SHAPES, Device, Engine, Shape, priced
 from kerv_cli.bench.settings import BenchSettings, EstimateSettings
 from kerv_cli.engine.cost import Profile
@@ -190,7 +190,7 @@ def closest(tokens: int, family: Family) -> Recorded | None:
     Tables are searched in order, those with a chunk length close to `tokens` tokens first. None if no table has such a
     setting.
     """
-    for table in nearest_tables(tokens):
+    for table in sorted(TABLES, key=lambda name: abs(TABLES[name] - tokens)):
         for one in recorded(table):
             if one.method == family.method and bool(one.drafts.nodes) == bool(family.drafts.nodes):
                 return one

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
-from kerv_cli.bench.expected import TABLES
 from kerv_cli.bench.physics import DEVICES
-from kerv_cli.bench.prices import ACTION, ANCHORS, Answer, Estimate, Projection
+from kerv_cli.bench.prices import ACTION, ANCHORS, FAMILIES, Answer, Estimate, Projection, closest
 
 if TYPE_CHECKING:
     from kerv_cli.bench.described import Described
@@ -212,14 +211,14 @@ def document(one: Estimate) -> dict[str, Any]:
 
 def notes(policy: Described | None, estimates: Sequence[Estimate]) -> list[str]:
     """Return the assumptions behind the tables, one line each."""
-    methods: dict[str, list[str]] = {}
-    for one in estimates[0].answers:
-        if one.own_acceptance_from:
-            methods.setdefault(one.own_acceptance_from.split(",")[0], []).append(one.method)
+    best, methods = estimates[0], dict[tuple[str, int], list[str]]()
+    priced = set(map(attrgetter("family"), best.answers))
+    for family in FAMILIES:
+        if family.name in priced and (shown := closest(best.tokens, family)) is not None:
+            methods.setdefault((shown.table, shown.tokens), []).append(family.method)
     sources = []
-    for file, names in methods.items():
-        table = Path(file)
-        sources.append(f"{table.name} ({TABLES[table.stem]} tokens per chunk) for {', '.join(names)}")
+    for (table, tokens), names in methods.items():
+        sources.append(f"{table}.csv ({tokens} tokens per chunk) for {', '.join(names)}")
     source = "this installation has no results/tables"
     if sources:
         source = f"results/tables/{'; '.join(sources)}. On your tasks it may be lower"

@@ -34,7 +34,7 @@ def export_board(
     database: Database,
     names: Collection[str],
     folder: Path,
-    advance: Callable[[int, int, str], None] = lambda done, total, text: None,
+    advance: Callable[[int, int, str], None],
 ) -> list[Path]:
     """Write the pages of a board into a folder, and return the paths of the files, `index.html` first.
 
