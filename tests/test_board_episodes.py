@@ -254,7 +254,8 @@ def test_a_person_gets_from_a_failure_to_its_film_a_decode_and_rerun(page, addre
     page.get_by_role("button", name="play").click()
     expect(output).to_have_text("step 12")
     # the next frame may still be loading
-    page.wait_for_function("image => image.complete && image.naturalWidth === 240", arg=image.element_handle())
+    width = page.wait_for_function("image => image.complete && image.naturalWidth", arg=image.element_handle())
+    assert width.json_value() == 240
 
     link = page.get_by_role("link", name="Open in Rerun")
     recording = parse_qs(urlsplit(link.get_attribute("href")).query)["url"]

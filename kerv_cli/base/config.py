@@ -53,7 +53,7 @@ def conf_dir() -> Path:
 
 
 def command_of_a_study(word: str) -> str | None:
-    """Return the first command in the study files that contains the setting `word`. None if there is none.
+    """Return the first command in the study files that contains the setting `word`. None if no command does.
 
     The list `first` of a study file holds the commands that make what the study needs, such as targets and drafters.
 

@@ -206,8 +206,8 @@ class ProposerPart(Part):
         merged: Whether it merges chains of several proposers.
         has_boundary: Whether a boundary chooses between retrieval and a drafter.
         looks_up: Whether it searches a datastore.
-        cost: Kind of cost under which a latency profile gives the seconds of a draft. Empty if there is none.
-        measured_by: Name of the method whose decodes measure this cost. Empty if there is none.
+        cost: Kind of cost under which a latency profile gives the seconds of a draft. Empty if it has no cost.
+        measured_by: Name of the method whose decodes measure this cost. Empty if no method does.
     """
 
     kind = "proposer"

@@ -43,7 +43,7 @@ class Model:
     Attributes:
         name: Name of the policy or of the shape.
         target: The target, a ReadableTarget.
-        drafter: The policy's drafter. If there is none, a drafter with random weights.
+        drafter: The policy's drafter, or a drafter with random weights if the policy has no drafter.
         observation: The observation to decode: all images are black, and all numbers 0.
         is_shape: Whether the model is untrained, with the size that a shape gives.
     """

@@ -177,7 +177,7 @@ def _asked(request: Request) -> tuple[list[Cell], dict[str, Any]]:
     """Read the episodes of a study for one of its pages: all episodes, or the failures.
 
     Returns:
-        cells: The episodes: all, or only those of the setting and task that the address names.
+        cells: All episodes, or only the episodes of the setting and task that the address names.
         values: Values for the templates of both pages: `study`, `baseline`, `known` (all settings and tasks) and
             `chosen` (the setting and task that the address names).
 

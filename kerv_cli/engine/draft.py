@@ -77,7 +77,7 @@ class Draft:
             try:
                 reached = max(self.tree.depths, default=-1) + 1 if device == HOST else self.levels
             except ValueError as error:
-                raise KervError(f"the proposer '{proposer}' drafted a tree that is none: {error}") from error
+                raise KervError(f"the proposer '{proposer}' drafted an invalid tree: {error}") from error
             if len(self) and not reached:
                 raise KervError(f"the proposer '{proposer}' drafted a tree on {device} without Draft.levels")
         if reached > depth:

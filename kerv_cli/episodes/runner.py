@@ -191,7 +191,7 @@ def _one_after_another(
 def _take(waiting: list[Request[K]], task: str) -> Request[K]:
     """Remove a waiting request of `task` from the list, and return it.
 
-    If there is none of `task`, take a request of the task with the most waiting requests.
+    If no request of `task` is waiting, take a request of the task with the most waiting requests.
     """
     tasks = [request.task for request in waiting]
     wanted = task if task in tasks else Counter(tasks).most_common(1)[0][0]

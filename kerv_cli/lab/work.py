@@ -300,7 +300,8 @@ class Queue:
         A block is not free while another worker runs one of its episodes, even for another study.
 
         Args:
-            ended: The block that this worker has just finished. It is removed from the queue. None if there is none.
+            ended: The block that this worker has just finished. It is removed from the queue. None if the worker has
+                finished none.
         """
         with self.database.writing() as connection:
             if ended is not None:
