@@ -406,10 +406,6 @@ ANSWERS = [
     ("sweep threshold.r=1,2,3", "of which study? name one, study=NAME: 'kerv sweep' lists them; 'kerv rollout -m'"),
     # artifacts and policies
     (
-        "calibrate success",
-        "is there, as a part of a shipped policy: policy.artifacts.certificate=NAME makes one of yours",
-    ),
-    (
         "build drafter checkpoint=published",
         "is there, as a part of a shipped policy: policy.artifacts.drafter=NAME makes one of yours",
     ),

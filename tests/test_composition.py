@@ -101,9 +101,6 @@ def test_settings_survive_a_file(method):
         ("method=one_pass prefill_draft.sources=[early,nope]", "source of a merged draft 'nope'"),
         ("method=one_pass prefill_draft.fallback=[drafter]", "source 'drafter' of a merged draft"),
         ("method=one_pass prefill_draft.sources=[]", "name at least one of sources"),
-        ("method=one_pass_certified prefill_draft.outside=none", "outside=none: it does not draft whole chunks"),
-        ("method=one_pass_certified prefill_draft.outside=drafter", "set prefill_draft.outside=merged, or"),
-        ("method=one_pass_certified prefill_draft.outside=erly", "prefill_draft.outside 'erly': did you mean early"),
         ("prefill_draft.kind=drafter", "prefill_draft=drafter"),
         ("chunk=5", "trained for 4 control steps"),
         ("proposer.kind=nope", "proposer.kind 'nope'"),
@@ -184,8 +181,6 @@ def test_a_threshold_that_nothing_reads_may_be_batched():
         ("method=one_pass prefill_draft.sources=[early] prefill_draft.fallback=[retrieval]", ("early", "datastore")),
         ("method=one_pass skip=similarity skip.s_min=0.99", ("early", "datastore")),
         ("method=scout_unverified", ("scout",)),
-        ("method=one_pass_certified", ("certificate", "early", "drafter")),
-        ("method=one_pass_certified prefill_draft.outside=hold", ("certificate", "drafter")),
         ("method=sp_vla", ()),
     ],
 )
@@ -241,11 +236,6 @@ def test_a_sweep_names_what_none_of_its_settings_reads():
     common = ("acceptance=relaxed", "policy.artifacts.early=mine", "runtime.workers=2")
     found = idle_overrides(ResolvedStudy(SweepSettings(), settings, points, common))
     assert list(found) == ["a: threshold.r=3", "policy.artifacts.early=mine"]
-
-
-def test_a_merged_draft_needs_what_its_sources_need():
-    asked = composed("method=one_pass", "prefill_draft.sources=[scoped,early]")
-    assert {"certificate", "early"} <= set(Method.of(asked).needs)
 
 
 def test_a_tree_with_more_children_than_there_are_tokens_is_refused(policies):

@@ -219,8 +219,7 @@ def test_a_target_that_decodes_in_parallel_takes_no_drafts(results, command):
     assert "decodes all tokens at once" in told(*command.split(), MINE, "--plan", code=2)
 
 
-def test_a_certificate_is_made_from_what_its_candidates_read():
-    assert needs(("one_pass_certified",), sees=True) == ("drafter", "early", "scout", "certificate")
+def test_a_method_needs_no_more_than_its_parts_read():
     assert needs(("one_pass",), sees=True) == ("early",)
 
 
@@ -251,7 +250,6 @@ def test_a_wrong_target_is_noticed_before_anything_else(command):
     ("words", "command"),
     [
         ("policy.artifacts.scout=m method=scout_unverified", "train drafter drafter=scout policy.target=mt10-vision"),
-        ("policy.artifacts.certificate=m method=one_pass_certified", "calibrate success policy.target=mt10-vision"),
     ],
 )
 def test_a_missing_artifact_with_a_name_is_answered_with_the_command_that_makes_it(words, command, tmp_path):

@@ -273,7 +273,6 @@ OUTSIDE = "../../../outside"
         f"build drafter checkpoint=public policy.artifacts.drafter={OUTSIDE}",
         f"build datastore policy.artifacts.datastore={OUTSIDE} demos=few",
         f"calibrate policy.artifacts.calibration={OUTSIDE} demos=few",
-        f"calibrate success policy.artifacts.certificate={OUTSIDE}",
     ],
 )
 def test_a_command_writes_nothing_outside_the_results_folder(demonstrated, line):

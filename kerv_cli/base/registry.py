@@ -327,18 +327,14 @@ class ArtifactPart(Part):
         sees: Whether the artifact needs a target that reads images.
         by_task: Whether it contains separate numbers or data for each task.
         needs_task: Whether it can be used only for tasks that it contains.
-        names_more: Whether its description names further artifacts that it needs.
         described_by: Name of the file that describes the artifact. If empty, it is `<kind>.json`.
-        study: Name of the study that makes the artifact. Empty if no study makes it.
     """
 
     kind = "artifact"
     sees: bool = False
     by_task: bool = False
     needs_task: bool = False
-    names_more: bool = False
     described_by: str = ""
-    study: str = ""
 
     def built(self) -> Any:
         """Return an instance of the subclass of `Artifact` that makes and loads artifacts of this kind."""

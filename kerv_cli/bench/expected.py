@@ -198,7 +198,7 @@ def _least(enough: Callable[[float], bool]) -> float:
 TABLES = {"papers": 4, "papers_libero": 7, "main": 16}
 """The published tables in results/tables, each with N, the number of tokens per chunk in the table's decodes."""
 
-_SOURCES = {"merged": "early", "early": "early", "scout": "scout", "scoped": "scout", "retrieval": "retrieval"}
+_SOURCES = {"merged": "early", "early": "early", "scout": "scout", "retrieval": "retrieval"}
 _DRAFTERS = ("drafter", "hybrid")
 
 

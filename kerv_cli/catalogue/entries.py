@@ -361,7 +361,7 @@ def artifact_entry(folder: Path, kind: str) -> RunEntry:
 
 
 def _made_from(value: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[str, str]:
-    hashes = dict(value.get("drafts") or {})  # of a certificate
+    hashes: dict[str, str] = {}
     for kind, entry in (("target", value.get("target")), ("demos", value.get("demos") or provenance.get("demos"))):
         sha256 = entry.get("sha256") if isinstance(entry, Mapping) else entry
         hashes |= {kind: str(sha256)} if sha256 else {}

@@ -1,14 +1,14 @@
-"""`kerv calibrate` and `kerv calibrate success`: fit constants of the methods, and certify their success."""
+"""`kerv calibrate`: fit constants of the methods."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import typer
 
-from kerv_cli.cli.command import Cfg, command
-from kerv_cli.cli.common import AsJson, ShowPlan, as_planned, end_with_json, print_rows, print_table, settings_yaml
-from kerv_cli.training.settings import CalibrateSettings, CalibrateSuccessSettings
+from kerv_cli.cli.command import command
+from kerv_cli.cli.common import ShowPlan, as_planned, print_table
+from kerv_cli.training.settings import CalibrateSettings
 
 if TYPE_CHECKING:
     from kerv_cli.methods.calibration import SkipSection
@@ -55,53 +55,3 @@ def _print_skip(skip: SkipSection) -> None:
     columns = ("task", "s_min", "low", "high", "would be skipped", limit, "mean error", "entries")
     best = f"best neighbour in another episode, {skip.confidence:.0%} with an error of at most {skip.epsilon:g}"
     print_table(columns, rows, f"verify-skip, {best}")
-
-
-@command(
-    "calibrate success",
-    CalibrateSuccessSettings,
-    keys="study margin delta task episodes policy.target policy.artifacts runtime.workers results",
-    each="rollout",
-)
-def success(overrides: list[str], cfg: Cfg = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:
-    """Run a study's settings on seeds of their own, the most cautious first, and certify which keep AR's success.
-
-    Existing episodes are reused. Choose the number of episodes before you look at any result.
-
-    Examples:
-        kerv calibrate success policy.target=mine
-        kerv calibrate success policy.artifacts.certificate=mine margin=3 episodes=50 seed=50600 again=true --plan
-    """
-    from kerv_cli.cli.studies import planned_study, print_settings, print_study_plan, run_study
-    from kerv_cli.episodes.resolve import resolve
-
-    resolved = resolve(overrides, "calibrate_success", CalibrateSuccessSettings)
-    settings = cast(CalibrateSuccessSettings, resolved.sweep)
-    if cfg:
-        for line in settings_yaml(settings).splitlines():
-            if line.split(":")[0] in ("margin", "delta", "again"):
-                typer.echo(line)
-        typer.echo("---")
-        print_settings(resolved)
-        return
-    # these import torch, which --cfg and a mistyped key must not wait for
-    from kerv_cli.lab.runs import making
-    from kerv_cli.report.certificate import candidate_rows, certify, folder_of, planned_certificate, write
-
-    folder = folder_of(resolved)
-    planned = planned_study(resolved, ["calibrate", "success", *overrides])
-    certificate = planned_certificate(resolved, planned, planned.episodes, settings)
-    if plan:
-        print_study_plan(planned, as_json)
-        return
-    with making(planned.database, "certificate", folder):
-        if run_study(planned).failed:
-            raise typer.Exit(1)
-        certificate = certify(certificate, planned, planned.episodes, resolved.study.baseline)
-        path = write(folder, certificate)
-    rows = candidate_rows(certificate)
-    if as_json:
-        end_with_json({"certificate": path, "sentence": certificate.sentence(), "candidates": rows})
-    title = f"not more than {settings.margin:g} points below AR? tested in this order, each at {certificate.delta:g}"
-    print_rows(rows, title)
-    typer.echo(f"{certificate.sentence()}\n{path}")

@@ -21,7 +21,7 @@ NOT_OF_STEPS = ("for", "steps", "quick")
     typed={"for": "methods"},
 )
 def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = False) -> None:
-    """Make all artifacts of a target that methods need, in order: drafters, datastore, calibration, certificate.
+    """Make all artifacts of a target that methods need, in order: drafters, datastore, calibration.
 
     Existing artifacts are skipped. The same command continues after an interruption.
 
@@ -38,8 +38,8 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
     steps = planned(settings, database)
     lines, rows = {}, []
     for step in steps:
-        hidden = (*NOT_OF_STEPS, "demos") if step.command[-1] == "success" else NOT_OF_STEPS
-        lines[step.kind] = [*step.command, *(word for word in overrides if word.split("=")[0] not in hidden)]
+        passed_on = (word for word in overrides if word.split("=")[0] not in NOT_OF_STEPS)
+        lines[step.kind] = [*step.command, *passed_on]
         rows.append((step.kind, step.state, f"kerv {shlex.join(lines[step.kind])}"))
     print_table(("what", "state", "command"), rows, name)
     if plan:
@@ -54,23 +54,4 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
             typer.echo(f"\nkerv {shlex.join(line)}")
             if code := typer.main.get_command(app).main(line, standalone_mode=False):
                 raise typer.Exit(code)
-    if failing := unsolved_by(settings):
-        typer.echo(f"\n{name}: {failing}")
-        return
     typer.echo(f"\n{name} is ready: kerv sweep study=own policy.target={name}{results_word(overrides)}")
-
-
-def unsolved_by(settings: PrepareSettings) -> str:
-    """Return a sentence if the certificate's test has shown that the policy does not solve its tasks. Otherwise ""."""
-    from kerv_cli.methods.artifacts import Artifacts
-    from kerv_cli.methods.certified.certificate import CertificateArtifact
-    from kerv_cli.report.tables import SOLVED
-    from kerv_cli.report.verdict import unsolved
-
-    artifact = CertificateArtifact()
-    path = Artifacts(settings.results, settings.policy).path(artifact.kind)
-    if not artifact.json(path).is_file():
-        return ""
-    first = artifact.read(path).candidates[0]
-    success = first.ar / first.pairs if first.pairs else 1.0
-    return unsolved("autoregressive decoding", success) if success < SOLVED else ""

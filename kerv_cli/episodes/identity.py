@@ -276,9 +276,8 @@ def idle_keys(settings: RolloutSettings) -> dict[str, str]:
     for kind, part in method.parts.items():
         idle |= flat({kind: part.idle(method.settings[kind])})
     needed, artifacts = set(method.needs), ArtifactPart.every()
-    if not any(artifacts[kind].names_more for kind in needed):
-        for kind in artifacts.keys() - needed:
-            idle[f"policy.artifacts.{kind}"] = f"method {settings.method} reads no {kind}"
+    for kind in artifacts.keys() - needed:
+        idle[f"policy.artifacts.{kind}"] = f"method {settings.method} reads no {kind}"
     for group in PART_GROUPS[len(METHOD_KINDS) :]:
         if group not in needed:
             idle[group] = f"method {settings.method} reads no {group}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from operator import attrgetter
 from pathlib import Path
 
@@ -74,8 +73,7 @@ def check(settings: RolloutSettings) -> dict[str, str]:
             raise UsageError(f"deviation_every={settings.deviation_every}: not in batches. Leave out rollout.batch")
     method.check(target, settings.rollout.batch)
     profile = _check_clock(settings, spec, target)
-    world = dataclasses.asdict(settings.world)
-    hashes = artifacts.check(method.needs, Use(method.settings, settings.runtime.dtype, spec.name, tasks, world))
+    hashes = artifacts.check(method.needs, Use(method.settings, tasks))
     # stored with every episode, so that tables show which policies read the privileged state
     observation = str(target.settings.get(OBSERVATION, "vision"))
     observation = PRIVILEGED if observation == "state" else observation

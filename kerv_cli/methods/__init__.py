@@ -10,7 +10,6 @@
     reuse                       Jacobi decoding as in PD-VLA, and prompt lookup in the last chunk's tokens
     merged                      ours: several drafts in one tree, before the prefill (`method=one_pass`)
     motion                      ours: accept FAST tokens, and stop decoding, by the motion that the tokens stand for
-    certified                   ours: skip verification on tasks for which a certificate limits the loss of success
 
 Each file above, and the `__init__.py` of each folder, contains the parts of its family, with their settings. Importing
 these files imports neither torch nor numpy. Code that needs torch or numpy, such as a drafter's network, is in another
@@ -28,4 +27,4 @@ from __future__ import annotations
 # importing a family registers its parts; this is their order in error messages and help texts
 # isort: off
 from kerv_cli.methods import ar, spec_vla, eagle, early, calibrated, kerv, unverified, heisd, reuse  # noqa: F401
-from kerv_cli.methods import merged, motion, certified  # noqa: F401
+from kerv_cli.methods import merged, motion  # noqa: F401

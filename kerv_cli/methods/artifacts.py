@@ -34,23 +34,15 @@ _LOADED: dict[tuple[Any, ...], Any] = {}
 
 @dataclass(frozen=True)
 class Use:
-    """What a policy's artifacts will be used for.
-
-    Before any weights are loaded, each artifact checks that it was made for this use.
+    """What a policy's artifacts will be used for. Each artifact checks it before any weights are loaded.
 
     Args:
         method: Settings of the method's parts, by the kind of the part, such as `proposer`.
-        dtype: Number format of the models.
-        environment: Name of the policy's environment.
         tasks: Full names of the tasks. Empty if a client of `kerv serve` names the tasks later.
-        world: Camera and horizon (maximum episode length). None if a client of `kerv serve` runs the episodes.
     """
 
     method: Mapping[str, Any]
-    dtype: str
-    environment: str
     tasks: tuple[str, ...] = ()
-    world: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -166,15 +158,10 @@ class Artifact(Generic[T]):
         """Return the hashes of the other artifacts that this artifact was made from, by kind."""
         return {}
 
-    def needs(self, description: T) -> tuple[str, ...]:
-        """Return the kinds of the other artifacts that a method needs if it uses this artifact."""
-        return ()
-
     def check_use(self, description: T, use: Use) -> None:
         """Refuse a use that the artifact was not made for. This base class allows every use.
 
         Raises:
-            UsageError: The artifact was made for another method, environment, camera or horizon.
             CheckpointError: The artifact lacks something that the method reads.
         """
 
@@ -305,17 +292,14 @@ class Artifacts:
             use: The method and the world that the artifacts will be used in. If None, the use is not checked.
 
         Returns:
-            The hashes, by kind, of the target, the artifacts of `kinds` and the further artifacts that they need.
+            The hashes, by kind, of the target and of the artifacts of `kinds`.
 
         Raises:
             CheckpointError: An artifact is missing, damaged, made for another target, or made from another version of
                 an artifact than the policy uses.
-            UsageError: An artifact was not made for this use.
         """
-        hashes, sources, todo = {TARGET: self.description.sha256}, [], list(kinds)
-        for kind in todo:
-            if kind in hashes:
-                continue
+        hashes, sources = {TARGET: self.description.sha256}, []
+        for kind in dict.fromkeys(kinds):
             files, path = kind_of(kind), self.path(kind)
             if files.command and not self.exists(kind):
                 raise CheckpointError(
@@ -323,7 +307,6 @@ class Artifacts:
                 )
             description = files.checked(path, self.description)
             hashes[kind] = files.digest(path, description)
-            todo += files.needs(description)
             what = f"the {files.noun} in {path} was {files.made}"
             sources.append((files.sources(description), what, self._again(files, path)))
             if use is not None:

@@ -63,7 +63,6 @@ METHODS = {
 }
 """Family of methods -> what its methods do."""
 WORDS = {
-    "certified": "skips verification only as far as a test of success allows",
     "chain": "drafts one chain of tokens in place of a tree",
     "code": "as in the public code, where the paper says otherwise",
     "literal": "the paper's formula, word for word",

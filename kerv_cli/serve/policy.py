@@ -69,8 +69,7 @@ class Policy:
         self.task = spec.task(name).name if spec and name else name
         self.method = Method.of(settings)
         self.method.check(description)
-        use = Use(self.method.settings, settings.runtime.dtype, description.environment)
-        self.identity = self.artifacts.check(self.method.needs, use)
+        self.identity = self.artifacts.check(self.method.needs, Use(self.method.settings))
         images_alone = TargetPart.find(description.family).images_alone
         self.interface = Interface(description, spec, settings.gripper, images_alone)
         stored = ((), ()) if images_alone else description.state_range or ((), ())

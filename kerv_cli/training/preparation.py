@@ -10,7 +10,6 @@ from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.registry import ArtifactPart
 from kerv_cli.catalogue.entries import artifact_entry
-from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import command_to_go_on
@@ -19,7 +18,6 @@ from kerv_cli.methods.compose import Method
 from kerv_cli.methods.drafters import TrainableDrafter
 from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.training.settings import PrepareSettings, TrainDrafterSettings
-from kerv_cli.worlds import specs
 
 THERE, MISSING = "there", "missing"
 
@@ -58,9 +56,7 @@ def plan(settings: PrepareSettings, database: Database) -> list[Step]:
     artifacts = Artifacts(settings.results, settings.policy)
     description = artifacts.description
     description.check_autoregressive(f"policy.target={settings.policy.target}", "it needs nothing more")
-    spec = specs().get(description.environment)
-    runnable = spec is not None and bool(spec.world_class)
-    kinds = needs(tuple(settings.methods), bool(description.cameras), runnable)
+    kinds = needs(tuple(settings.methods), bool(description.cameras))
     steps: list[Step] = []
     for kind in kinds:
         files = kind_of(kind)
@@ -70,19 +66,18 @@ def plan(settings: PrepareSettings, database: Database) -> list[Step]:
                 command = (*command, f"train.steps={settings.steps}")
             number = compose("train_drafter", command[2:], TrainDrafterSettings).train.steps
         steps.append(Step(kind, _state(artifacts, database, kind, kinds), command, number))
-    if any(step.state != THERE and not ArtifactPart.find(step.kind).study for step in steps):
+    if any(step.state != THERE for step in steps):
         demos_for(settings, description, database)
     return steps
 
 
 @functools.cache
-def needs(methods: tuple[str, ...], sees: bool, runnable: bool = True) -> tuple[str, ...]:
+def needs(methods: tuple[str, ...], sees: bool) -> tuple[str, ...]:
     """Return the kinds of artifacts that the methods need, in the order in which they must be made.
 
     Args:
         methods: Names of methods. If empty, all methods that work with the target.
         sees: Whether the target has cameras.
-        runnable: Whether episodes can run in the target's environment. Some environments exist only as recordings.
 
     Raises:
         UnknownName: A method does not exist.
@@ -95,19 +90,11 @@ def needs(methods: tuple[str, ...], sees: bool, runnable: bool = True) -> tuple[
         if methods and not sees and any(artifacts[kind].sees for kind in needed):
             raise UsageError(f"for={name}: it needs a target that sees, this one reads the state")
         kinds.update(needed)
-    for study in [artifacts[kind].study for kind in kinds]:
-        if study and sees and runnable:
-            for settings in resolve([f"study={study}"]).settings.values():
-                kinds.update(Method.of(settings).needs)
     order: list[str] = []
     for kind, part in artifacts.items():
         order += [*part.needed(None), kind]
-    made = []
-    for kind in dict.fromkeys(order):
-        possible = (sees or not artifacts[kind].sees) and (runnable or not artifacts[kind].study)
-        if kind in kinds and possible and kind_of(kind).command:
-            made.append(kind)
-    return tuple(made)
+    possible = [kind for kind in dict.fromkeys(order) if kind in kinds and (sees or not artifacts[kind].sees)]
+    return tuple(kind for kind in possible if kind_of(kind).command)
 
 
 def _state(artifacts: Artifacts, database: Database, kind: str, kinds: Sequence[str]) -> str:

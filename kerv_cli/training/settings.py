@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import choice, limits, number, setting
 from kerv_cli.base.settings import RunSettings, TaskSettings, chosen
-from kerv_cli.episodes.settings import DEFAULT_TASKS, SweepSettings
+from kerv_cli.episodes.settings import DEFAULT_TASKS
 from kerv_cli.methods.settings import POLICY, MethodSettings, PolicySettings
 from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.worlds.settings import WorldSettings
@@ -217,20 +217,6 @@ class CalibrateSettings(DemonstrationSettings):
         """
         if not self.boundary_windows:
             raise UsageError(f"{prefix}boundary_windows=[]: name at least one number of positions")
-
-
-@dataclass
-class CalibrateSuccessSettings(SweepSettings):
-    """Settings of `kerv calibrate success`, which certifies that a method loses little success (docs/methods.md §4.6).
-
-    All other command-line arguments are settings of the rollouts in `conf/study/certify.yaml`.
-    """
-
-    groups: ClassVar = {"study": "certify"}
-
-    margin: float = number(5.0, above=0, most=99.9, help="points of success that may be lost against AR")
-    delta: float = number(0.1, above=0, most=0.5, help="the certificate holds with probability 1 - delta")
-    again: bool = setting(False, "test a policy once more, on other seeds, at half of delta for each earlier test")
 
 
 def refuse_unused(train: TrainSettings, keys: Sequence[str], why: str) -> None:
