@@ -79,7 +79,6 @@ def study_of(
     tasks: Sequence[str],
     name: str = "threshold",
     block: int = 5,
-    repeats: int = 1,
     **about: Any,
 ) -> Study:
     """A study of these settings, by label; `ar` is the baseline. `plan_study` puts it into a database."""
@@ -94,7 +93,7 @@ def study_of(
         for label, one in settings.items()
     )
     about = {"baseline": "ar", "title": "Acceptance threshold", "axis": "threshold.r"} | about
-    episodes = all_episodes(made, tasks, block, repeats)
+    episodes = all_episodes(made, tasks, block)
     return Study(NOWHERE, name, "sweep", made, episodes, block=block, **about)
 
 

@@ -187,7 +187,7 @@ def test_pages_are_quick_with_ten_thousand_episodes_and_two_hundred_runs(tmp_pat
     store.save()
     with Run(store.database, "sweep", "large", ["sweep"]):
         pass
-    names = ("work", "task", "seed", "repeat")
+    names = ("work", "task", "seed")
     with store.database.writing() as connection:
         connection.execute(sa.insert(BLOCKS).values(id="b", run="r", seeds="", started=now(), code="", about={}))
         connection.execute(

@@ -166,10 +166,14 @@ def test_a_measure_that_an_older_kerv_did_not_store_is_missing_until_it_is_measu
     assert store.frame()["closest_approach"].isna().all()
 
 
-def test_newer_tables_are_refused(database, monkeypatch):
+@pytest.mark.parametrize(
+    ("schema", "message"),
+    [(0, "newer kerv"), (99, "from an older kerv (schema 2, this one reads 99): choose another results= folder")],
+)
+def test_tables_of_another_kerv_are_refused(database, monkeypatch, schema, message):
     begun(database, "a")
-    monkeypatch.setattr(module, "SCHEMA", 0)
-    with refused("newer kerv", error=CheckpointError):
+    monkeypatch.setattr(module, "SCHEMA", schema)
+    with refused(message, error=CheckpointError):
         studies(opened(database.results))
     with pytest.raises(CheckpointError):
         begun(opened(database.results), "b")

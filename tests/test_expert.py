@@ -63,7 +63,7 @@ def test_rows_keep_it_and_measures_are_undefined_instead_of_divided_by_zero(epis
     third = stored.to_pylist()[3]
     assert third["actions"] == episode.decodes[3].actions.tolist()
     assert (third["mode"], third["tokens"], third["rounds"]) == ("expert", [], [])
-    frame = pd.DataFrame([row | {"task": NAME, "seed": EVALUATION_SEED, "repeat": 0, "block": "b"}])
+    frame = pd.DataFrame([row | {"task": NAME, "seed": EVALUATION_SEED, "block": "b"}])
     frame = frame.assign(difficulty=SPEC.task(NAME).difficulty, initial_state=str(row["initial_state"]), **STAMPS)
     frame["decode_seconds"] = [np.array([decode.seconds for decode in episode.decodes])]
     slow = frame.assign(label="slow", seconds=frame["seconds"] * 10, success=False)

@@ -63,8 +63,8 @@ def test_episodes_and_decodes_as_parquet(made, tmp_path):
     answer("runs", "export", "threshold", "--to", "parquet", "--dir", str(tmp_path), f"results={made}")
     episodes, decodes = (pd.read_parquet(tmp_path / f"threshold/{name}.parquet") for name in ("episodes", "decodes"))
     assert len(episodes) == len(Study(opened(made), "threshold").frame()) == 32
-    counted = decodes.groupby(["label", "task", "seed", "repeat"]).size()
-    assert counted.to_dict() == episodes.set_index(["label", "task", "seed", "repeat"])["decodes"].to_dict()
+    counted = decodes.groupby(["label", "task", "seed"]).size()
+    assert counted.to_dict() == episodes.set_index(["label", "task", "seed"])["decodes"].to_dict()
 
 
 def test_a_foreign_database_that_never_ends_is_refused(tmp_path):

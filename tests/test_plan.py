@@ -138,16 +138,16 @@ class A(list[int]):
     assert hashlib.sha256(_meaning(source)).hexdigest()[:16] == "8a841cd085411114"
 
 
-def test_blocks_go_by_repeat_task_and_seeds():
+def test_blocks_go_by_task_and_seeds():
     settings = {"ar": settings_of("ar", episodes=7), "b": settings_of("spec_vla", 9, episodes=7)}
-    study = study_of(settings, TASKS, block=3, repeats=2)
-    assert len({one.key for one in study.episodes}) == len(study.episodes) == 2 * 2 * 2 * 7
+    study = study_of(settings, TASKS, block=3)
+    assert len({one.key for one in study.episodes}) == len(study.episodes) == 2 * 2 * 7
     blocks = blocks_of(study.episodes, 3)
     assert [(b.task, len(b.seeds)) for b in blocks[:4]] == [*(("reach-v3", n) for n in (3, 3, 1)), ("push-v3", 3)]
     assert [b.seeds[0] for b in blocks[:3]] == [100_000, 100_003, 100_006]
     assert all([setting.label for setting in block.settings] == ["ar", "b"] for block in blocks)
     assert blocks[0].name == "reach-v3 100000-100002"
-    assert blocks[-1].name == "push-v3 100006 repeat 1"
+    assert blocks[-1].name == "push-v3 100006"
 
 
 def test_settings_take_turns_seed_by_seed_in_a_drawn_order():
@@ -289,8 +289,6 @@ def test_reasons_name_what_changed(database, monkeypatch):
     assert reason(same, weights={**IDENTITY, "target": "c" * 64}) == "weights of mt10-vision changed"
     another = dataclasses.replace(same, policy=dataclasses.replace(same.policy, target="mine"))
     assert reason(another, weights={**IDENTITY, "target": "c" * 64}) == "new setting"  # nobody's weights changed
-    repeated = study_of({"ar": settings_of("ar")}, ["reach-v3"], repeats=2)
-    assert why(plan_study(database, repeated)) == {"new repeat"}
     idle = settings_of("spec_vla", 3)
     idle.policy.artifacts["datastore"] = "mine"  # not read
     assert reason(idle) == ""

@@ -32,7 +32,7 @@ from kerv_cli.lab.work import RunEpisode
 from kerv_cli.report.measures import MACRO, MICRO, Result, averaged, columns_of, frame_of
 from kerv_cli.report.plots import acceptance_figure, curves_figure, png, study_figures, with_lines
 from kerv_cli.report.report import CSV_COLUMNS, Report, Unpublishable, further_of, refusals, render, report
-from kerv_cli.report.statistics import PairedCounts, mean_of, paired_difference, speedup, wilson
+from kerv_cli.report.statistics import PairedCounts, mean_of, paired_difference, speedup
 from kerv_cli.report.summary import (
     METHODS,
     UNVERIFIED,
@@ -297,28 +297,6 @@ def test_pairs_of_one_block_are_told_from_others(tmp_path):
     assert summary_frame(alone.results)["speed, per episode"].tolist() == ["1×", "–"]
     assert not_in_turn(alone.results) == ["kerv"]
     assert row_of(alone.table, label="kerv", averaging=MICRO)["pairs"] == 2
-
-
-def test_repeats_are_paired_with_their_own(tmp_path):
-    """The machine was ten times slower in the second repeat: for both sides."""
-    ran: set[tuple[str, int]] = set()
-
-    def prepare(setting, task):
-        one = ar(0.4) if setting.label == "ar" else ALL_ACCEPTED
-
-        def run(seed):
-            slower = 10 if (setting.label, seed) in ran else 1
-            ran.add((setting.label, seed))
-            return still_episode(task, seed, True, [replace(one, seconds=one.seconds * slower)])
-
-        return run
-
-    store, _ = swept(tmp_path, two_settings(2, repeats=2), prepare)
-    row = row_of(load_study(store).per_task, label="kerv")
-    # a repeat is another time, not another world: successes count once
-    assert (row["pairs"], row["episodes"], row["repeats"], row["seeds"]) == (2, 4, 2, "100000-100001")
-    assert (row["successes"], row["both"], row["success_low"]) == (2, 2, pytest.approx(wilson(2, 2).low))
-    assert row["speedup"] == row["speedup_low"] == row["speedup_high"] == pytest.approx(2.0)
 
 
 def test_every_method_is_explained_in_about_ten_words():

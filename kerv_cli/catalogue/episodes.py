@@ -22,8 +22,6 @@ LARGEST_ID = 2**31 - 1
 def outcomes(store: Study, task: str = "", seed: int | None = None) -> list[Any]:
     """Return one row for every label, task and seed of a study, in the study's order.
 
-    If an episode was measured several times, only the first repeat is returned, because all have the same outcome.
-
     Args:
         store: The study.
         task: Task of the episodes. If empty, episodes of all tasks are returned.
@@ -42,7 +40,7 @@ def outcomes(store: Study, task: str = "", seed: int | None = None) -> list[Any]
                 WANTED.c.error.is_not(None).label("failed"),
             )
             .select_from(WANTED.join(SETTINGS).join(STUDIES).outerjoin(EPISODES, EPISODES.c.id == WANTED.c.episode_id))
-            .where(STUDIES.c.name == store.name, WANTED.c.repeat == 0)
+            .where(STUDIES.c.name == store.name)
             .order_by(WANTED.c.position)
         )  # fmt: skip
         query = query if not task else query.where(WANTED.c.task == task)
@@ -57,8 +55,8 @@ class FoundEpisode:
     Attributes:
         id: Row number of the episode.
         store: The study.
-        episode: Setting, task, seed and repeat.
-        row: The episode's row, by column: setting, study, task, seed, repeat, block, start time and results.
+        episode: Setting, task and seed.
+        row: The episode's row, by column: setting, study, task, seed, block, start time and results.
         about: Machine and software versions that ran the episode.
         earlier: Seeds that must run before this episode, in this order, so that it gives the same tokens again. Empty
             unless the setting's skip rule adapts from episode to episode.
@@ -95,7 +93,7 @@ def find_episode(database: Database, number: int) -> FoundEpisode:
         UsageError: There is no such episode, or no study uses it any more, because it was run again.
     """
     with database.reading() as connection:
-        own = EPISODES.c["task", "seed", "repeat", "order", "block", "started"]
+        own = EPISODES.c["task", "seed", "order", "block", "started"]
         about = STUDIES.c.name.label("study"), STUDIES.c.kind, BLOCKS.c.about
         query = (
             sa.select(SETTINGS, *about, *own, *measures_in(connection))
@@ -107,8 +105,8 @@ def find_episode(database: Database, number: int) -> FoundEpisode:
         if row is None:
             raise UsageError(f"no study in {database.shown} has an episode {number}")
         setting = setting_of(row)
-        same = EPISODES.c.work == row.work, EPISODES.c.block == row.block, EPISODES.c.repeat == row.repeat
+        same = EPISODES.c.work == row.work, EPISODES.c.block == row.block
         before = sa.select(EPISODES.c.seed).where(*same, EPISODES.c.order < row.order).order_by(EPISODES.c.order)
         earlier = tuple(connection.scalars(before)) if setting.depends_on_order else ()
-    episode, store = Episode(setting, row.task, row.seed, row.repeat), Study(database, row.study, row.kind)
+    episode, store = Episode(setting, row.task, row.seed), Study(database, row.study, row.kind)
     return FoundEpisode(number, store, episode, dict(row._mapping), row.about, earlier)

@@ -333,7 +333,7 @@ def _imported(results: Path, episode: Episode, one: Evaluation, recorded: Record
 
     Args:
         results: The results folder. It holds the episodes that kerv served.
-        episode: Setting, task, seed and repeat in the study.
+        episode: Setting, task and seed in the study.
         one: The evaluation.
         recorded: The recorded result.
     """

@@ -18,7 +18,7 @@ from kerv_cli.base.files import regular, write_folder
 from kerv_cli.episodes.identity import Setting
 from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.lab import database as tables
-from kerv_cli.lab.database import FILE, MEASURES, SCHEMA, Database, file_url, measures_in, newer
+from kerv_cli.lab.database import FILE, MEASURES, SCHEMA, Database, file_url, measures_in, other_schema
 from kerv_cli.lab.plan import Episode
 from kerv_cli.lab.store import ImportedEpisode, Study, stored_settings
 from kerv_cli.worlds.demos.files import foreign_table
@@ -54,7 +54,7 @@ def import_databases(database: Database, files: Sequence[Path], name: str = "") 
 
     Raises:
         UsageError: A file is `database` itself. Or `name` is given, and a file does not hold exactly one study.
-        CheckpointError: A file is damaged, or was written by a newer version of kerv.
+        CheckpointError: A file is damaged, or was written by another version of kerv.
     """
     names, notes = list[str](), list[str]()
     for file in files:
@@ -125,15 +125,15 @@ def _in_database(path: Path, database: Database, name: str, stack: contextlib.Ex
         stack: The file is closed when this stack is closed.
 
     Raises:
-        CheckpointError: The file is damaged, or was written by a newer version of kerv.
+        CheckpointError: The file is damaged, or was written by another version of kerv.
     """
     engine = sa.create_engine("sqlite://", creator=lambda: connect_foreign(path), poolclass=sa.pool.NullPool)
     with _damage(path):
         connection = stack.enter_context(engine.connect())
         about = tables.ABOUT.c
         version = int(connection.scalar(sa.select(about.value).where(about.key == "schema_version")) or 0)
-        if version > SCHEMA:
-            raise newer(path, version)
+        if version != SCHEMA:
+            raise other_schema(path, version)
         studies = connection.execute(sa.select(tables.STUDIES)).all()
         return [_stored(connection, path, row, database, name) for row in studies]
 
@@ -183,7 +183,7 @@ def _stored_episodes(connection: sa.Connection, path: Path, settings: dict[int, 
     )
     with _damage(path):
         for row in connection.execution_options(yield_per=100).execute(query).mappings():
-            episode = Episode(settings[row["setting_id"]], row["task"], row["seed"], row["repeat"])
+            episode = Episode(settings[row["setting_id"]], row["task"], row["seed"])
             values = {name: row[f"row.{name}"] for name in _ROW}
             decoded = foreign_table(row["parquet"]).cast(DECODE_SCHEMA)
             block = row["block"], row["about"], row["run"], row["seeds"], row["code"]

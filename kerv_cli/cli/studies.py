@@ -56,7 +56,7 @@ def planned_study(resolved: ResolvedStudy, command: Sequence[str], is_rollout: b
     settings, tasks = resolved.settings, resolved.tasks
     what = next(iter(settings)) if len(settings) == 1 else f"{len(settings)} settings"
     whose = _few(list(dict.fromkeys(setting.policy.target for setting in settings.values())), "targets")
-    number = len(settings) * len(tasks) * resolved.first.episodes * resolved.study.repeats
+    number = len(settings) * len(tasks) * resolved.first.episodes
     where = _few(tasks, "tasks")
     for override, reason in idle_overrides(resolved, not is_rollout).items():
         typer.echo(f"note: {override} has no effect: {reason}", err=True)
@@ -133,7 +133,6 @@ def _plan_rows(planned: Study) -> list[dict[str, object]]:
                 "reused": len(episodes) - len(reasons),
                 "tasks": len(set(map(attrgetter("task"), episodes))),
                 "seeds": seeds_text(map(attrgetter("seed"), episodes)),
-                "repeats": len(set(map(attrgetter("repeat"), episodes))),
                 "why": "; ".join(dict.fromkeys(reasons)),
             }
         )

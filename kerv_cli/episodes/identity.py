@@ -73,7 +73,7 @@ class Setting:
 
     @functools.cached_property
     def work(self) -> str:
-        """Hash of the settings, weights and data that determine a result. Task, seed and repeat are not included."""
+        """Hash of the settings, weights and data that determine a result. Task and seed are not included."""
         return work_of(self.settings, self.identity)
 
     @property
@@ -143,7 +143,7 @@ LATER: Mapping[str, Any] = {"threshold.over": "compared", "threshold.total": Fal
 
 
 def work_of(settings: Plain, identity: Identity, engine: int = ENGINE) -> str:
-    """Return the hash of the settings, weights and data that determine results. Task, seed and repeat are left out.
+    """Return the hash of the settings, weights and data that determine results. Task and seed are left out.
 
     Args:
         settings: The rollout's settings as nested plain values.

@@ -89,7 +89,6 @@ class StudySettings:
     settings: dict[str, str] = setting({}, "label -> overrides; comma lists expand into a grid")
     axis: str = setting("", "key on the plot's x axis, e.g. threshold.r")
     block: int = number(5, 1, 10_000, help="number of seeds for which the settings take turns in one process")
-    repeats: int = number(1, 1, 1_000, help="how often every episode is measured")
     seconds: float = number(
         1.0, above=0, most=86_400, help="guess of the seconds per episode, for a plan without measured ones"
     )

@@ -26,8 +26,8 @@ from kerv_cli.episodes.rows import EPISODE_SCHEMA, FLAG, FLOAT, INT
 from kerv_cli.lab.command import current_store, without_passwords
 
 FILE = "kerv.db"
-SCHEMA = 1
-"""Version of the tables. A database with a larger version is refused.
+SCHEMA = 2
+"""Version of the tables. A database with another version is refused.
 
 A new column in MEASURES, or the table QUEUE, needs no new version: it is added at the next write. Until then the
 column reads as null.
@@ -158,12 +158,12 @@ EPISODES = _table(
     sa.Column("id", sa.Integer, primary_key=True),
     *_required(_TEXT, "work", "task", "started"),
     *_required(sa.BigInteger, "seed"),
-    *_required(_INTEGER, "repeat", "order"),  # order: number of episodes that the block ran before it
+    *_required(_INTEGER, "order"),  # order: number of episodes that the block ran before it
     sa.Column("block", sa.ForeignKey("blocks.id"), nullable=False),
     *MEASURES,
     *_required(sa.LargeBinary, "decode_seconds"),  # (decodes,) little-endian float64
     # the same episode may run again in another block, with other settings or other code
-    sa.UniqueConstraint("work", "task", "seed", "repeat", "block"),
+    sa.UniqueConstraint("work", "task", "seed", "block"),
 )
 DECODES = _table(
     "decodes", _to("episode_id", "episodes.id", primary_key=True), sa.Column("parquet", sa.LargeBinary, nullable=False)
@@ -173,7 +173,6 @@ WANTED = _table(
     _to("setting_id", "settings.id", primary_key=True),
     sa.Column("task", _TEXT, primary_key=True),
     sa.Column("seed", sa.BigInteger, primary_key=True),
-    sa.Column("repeat", sa.Integer, primary_key=True),
     *_required(_INTEGER, "position"),
     sa.Column("episode_id", sa.ForeignKey("episodes.id", ondelete="SET NULL"), index=True),
     sa.Column("error", _TEXT),  # if the last attempt failed: the error in one line, then its traceback
@@ -186,7 +185,7 @@ QUEUE = _table(
     _to("study_id", "studies.id", nullable=False),
     *_required(_TEXT, "run"),  # id of the command that planned the block
     *_required(_INTEGER, "position", "newest"),  # newest: largest episodes.id when the block was planned
-    *_required(_LIST, "episodes"),  # work, task, seed and repeat of each
+    *_required(_LIST, "episodes"),  # work, task and seed of each
     *_required(_OBJECT, "about"),  # executor, workers
     sa.Column("worker", _TEXT, index=True),  # the process that has claimed the block; null: none
     sa.Column("heartbeat", _FLOAT),  # its newest sign of life, seconds since 1970 by the database's clock
@@ -319,9 +318,9 @@ class Database:
             if version is None:
                 with engine.execution_options(kerv_writes=True).begin() as connection:
                     version = _created(connection)
-            if version > SCHEMA:
+            if version != SCHEMA:
                 engine.dispose()
-                raise newer(self.shown, version)
+                raise other_schema(self.shown, version)
             self._engine = engine
         return self._engine
 
@@ -526,6 +525,10 @@ def _add_measures(connection: sa.Connection) -> None:
             connection.execute(sa.text(f"ALTER TABLE {EPISODES.name} ADD COLUMN {quote(column.name)} {kind}"))
 
 
-def newer(name: str | Path, version: int) -> CheckpointError:
-    """Return the error to raise for a database that a newer version of kerv has written."""
+def other_schema(name: str | Path, version: int) -> CheckpointError:
+    """Return the error to raise for a database that an older or newer version of kerv has written."""
+    if version < SCHEMA:
+        return CheckpointError(
+            f"{name} is from an older kerv (schema {version}, this one reads {SCHEMA}): choose another results= folder"
+        )
     return CheckpointError(f"{name} is from a newer kerv (schema {version}, this one reads {SCHEMA}): update kerv")

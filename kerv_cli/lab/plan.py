@@ -27,62 +27,58 @@ FULL_BATCHES = 16
 NEVER, TIMED, CHANGED, ALL = "never", "timed", "changed", "all"
 """Values of `rerun=`, which says which existing episodes to run again.
 
-NEVER runs no existing episode again. TIMED runs the episodes of a task, seed and repeat again unless one block ran them
+NEVER runs no existing episode again. TIMED runs the episodes of a task and seed again unless one block ran them
 for all settings in turn. CHANGED runs the episodes again that ran with another version of the code. ALL runs all
 episodes again.
 """
 
-Key = tuple[str, str, int, int]
-"""A setting's hash `work`, task, seed and repeat. Equal keys mean the same episode in any study."""
+Key = tuple[str, str, int]
+"""A setting's hash `work`, task and seed. Equal keys mean the same episode in any study."""
 K = TypeVar("K")
 
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode of a study. `repeat` counts measurements of the same setting, task and seed, from 0."""
+    """One episode of a study."""
 
     setting: Setting
     task: str
     seed: int
-    repeat: int = 0
 
     @property
     def key(self) -> Key:
-        """The setting's hash `work`, the task, the seed and the repeat. Equal keys mean the same episode."""
-        return self.setting.work, self.task, self.seed, self.repeat
+        """The setting's hash `work`, the task and the seed. Equal keys mean the same episode."""
+        return self.setting.work, self.task, self.seed
 
     @property
     def recording(self) -> str:
-        """File name of the episode's recording. Repeats of an episode have the same name."""
+        """File name of the episode's recording."""
         name = f"{self.setting.label.replace('=', '')}-{self.task}-{self.seed}-{self.setting.work[:6]}.rrd"
         return re.sub(r"[^\w.+-]", "_", name)[-200:]
 
 
-def all_episodes(
-    settings: Sequence[Setting], tasks: Iterable[str], block: int = 5, repeats: int = 1
-) -> tuple[Episode, ...]:
-    """Return every episode of these settings, ordered by repeat, task and block of seeds.
+def all_episodes(settings: Sequence[Setting], tasks: Iterable[str], block: int = 5) -> tuple[Episode, ...]:
+    """Return every episode of these settings, ordered by task and block of seeds.
 
     Args:
         settings: The settings to compare.
         tasks: Names of the tasks.
         block: Number of seeds in a block. All settings run these seeds before the next block begins.
-        repeats: How often every episode is measured.
 
     Raises:
         UsageError: There are more than MOST_EPISODES.
     """
     tasks = list(dict.fromkeys(tasks))
     numbers = [setting.settings["episodes"] for setting in settings]
-    total = len(tasks) * repeats * sum(numbers)
+    total = len(tasks) * sum(numbers)
     if total > MOST_EPISODES:
         raise UsageError(f"the study has {total} episodes: at most {MOST_EPISODES} are allowed")
     episodes: list[Episode] = []
-    for repeat, task, first in itertools.product(range(repeats), tasks, range(0, max(numbers, default=0), block)):
+    for task, first in itertools.product(tasks, range(0, max(numbers, default=0), block)):
         for setting, number in zip(settings, numbers, strict=True):
             start = setting.settings["seed"]
             seeds = range(start, start + number)[first : first + block]
-            episodes += [Episode(setting, task, seed, repeat) for seed in seeds]
+            episodes += [Episode(setting, task, seed) for seed in seeds]
     return tuple(episodes)
 
 
@@ -113,7 +109,7 @@ class StoredEpisode:
 
 @dataclass(frozen=True)
 class Block:
-    """Episodes of one task and one repeat, which one process runs. The settings take turns, seed by seed.
+    """Episodes of one task, which one process runs. The settings take turns, seed by seed.
 
     A block that runs as a batch (several episodes at once) has a single setting instead, and any tasks and seeds.
     """
@@ -148,8 +144,7 @@ class Block:
     @property
     def name(self) -> str:
         """Task and seeds, e.g. `reach-v3 100000-100004`."""
-        repeat = self.episodes[0].repeat
-        return f"{self.task} {seeds_text(self.seeds)}" + (f" repeat {repeat}" if repeat else "")
+        return f"{self.task} {seeds_text(self.seeds)}"
 
     @property
     def title(self) -> str:
@@ -171,7 +166,7 @@ class Block:
             yield from self.episodes
             return
         for seed, turn in sorted(grouped(self.episodes, attrgetter("seed")).items()):
-            digest = hashlib.sha256(f"{self.task} {seed} {turn[0].repeat}".encode()).digest()
+            digest = hashlib.sha256(f"{self.task} {seed}".encode()).digest()
             for index in np.random.default_rng(list(digest)).permutation(len(turn)):
                 yield turn[int(index)]
 
@@ -190,7 +185,7 @@ def split(
         episodes: The study's episodes.
         block: Number of seeds in a block, which one process runs.
         stored: Episodes in the database, by `Episode.key`.
-        rerun: Which existing episodes to run again. NEVER: none. TIMED: for each task, seed and repeat, the episodes of
+        rerun: Which existing episodes to run again. NEVER: none. TIMED: for each task and seed, the episodes of
             all settings, unless one block ran all of them in turn. Only then can their times be compared. CHANGED: the
             episodes that ran with another version of the code. ALL: all.
         since: Used only with ALL, if a command is resumed: the time at which it first began (ISO 8601). Episodes of
@@ -267,7 +262,7 @@ def _reasons(
         if stored.get(one.key):
             reasons[one] = of_rows
         elif one.key[:2] in tasks:
-            reasons[one] = "new repeat" if one.repeat else "new seeds"
+            reasons[one] = "new seeds"
         else:
             reasons[one] = "new task" if one.setting.work in works else change(one.setting)
     return reasons
@@ -281,20 +276,20 @@ def grouped(episodes: Iterable[Episode], key: Callable[[Episode], K]) -> dict[K,
     return groups
 
 
-def _turns(episodes: Iterable[Episode]) -> dict[tuple[str, int, int], list[Episode]]:
-    """Group episodes by task, seed and repeat. In such a group, the settings take turns."""
-    return grouped(episodes, lambda one: (one.task, one.seed, one.repeat))
+def _turns(episodes: Iterable[Episode]) -> dict[tuple[str, int], list[Episode]]:
+    """Group episodes by task and seed. In such a group, the settings take turns."""
+    return grouped(episodes, lambda one: (one.task, one.seed))
 
 
 def _ordered_parts(episodes: Iterable[Episode], block: int) -> list[list[Episode]]:
     """Return groups of episodes that must run together, in order, because each may change the results of the next.
 
-    A group holds one setting, task and repeat, and `block` successive seeds. Episodes of settings whose results do not
+    A group holds one setting and task, and `block` successive seeds. Episodes of settings whose results do not
     depend on the order are left out.
     """
 
-    def key(one: Episode) -> tuple[str, str, int, int]:
-        return one.setting.work, one.task, one.repeat, (one.seed - one.setting.settings["seed"]) // block
+    def key(one: Episode) -> tuple[str, str, int]:
+        return one.setting.work, one.task, (one.seed - one.setting.settings["seed"]) // block
 
     return list(grouped(filter(attrgetter("setting.depends_on_order"), episodes), key).values())
 
@@ -325,7 +320,7 @@ def _keep_whole_orders(usable: dict[Episode, list[StoredEpisode]], block: int) -
 def blocks_of(episodes: Iterable[Episode], block: int, workers: int = 1) -> list[Block]:
     """Group episodes into blocks, each to be run by one process.
 
-    The episodes of a block have the same task, the same repeat and the same number of threads. They have up to `block`
+    The episodes of a block have the same task and the same number of threads. They have up to `block`
     successive seeds. All seeds of a block run the same settings: seeds for which other settings must run get a block of
     their own. But if a setting's results depend on the order of its seeds, its seeds are never split.
 
@@ -338,14 +333,14 @@ def blocks_of(episodes: Iterable[Episode], block: int, workers: int = 1) -> list
     """
     by_way = grouped(episodes, lambda one: one.setting.batch > 1)
     groups: dict[tuple[object, ...], list[Episode]] = {}
-    for (task, seed, repeat), turn in _turns(by_way.get(False, ())).items():
+    for (task, seed), turn in _turns(by_way.get(False, ())).items():
         for threads, part in grouped(turn, lambda one: one.setting.settings["runtime"]["threads"]).items():
             index = (seed - min(one.setting.settings["seed"] for one in part)) // block
             ordered = list(filter(attrgetter("setting.depends_on_order"), part))
             same = sorted(map(attrgetter("setting.work"), ordered or part))
-            groups.setdefault((task, repeat, threads, index, *same), []).extend(part)
+            groups.setdefault((task, threads, index, *same), []).extend(part)
     blocks = list(map(Block, map(tuple, groups.values())))
-    for group in grouped(by_way.get(True, ()), lambda one: (one.setting.work, one.repeat)).values():
+    for group in grouped(by_way.get(True, ()), lambda one: one.setting.work).values():
         size = min(FULL_BATCHES * group[0].setting.batch, -(-len(group) // workers))
         blocks += [Block(tuple(group[first : first + size])) for first in range(0, len(group), size)]
     return blocks

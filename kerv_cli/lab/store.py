@@ -54,7 +54,7 @@ class ImportedEpisode:
     """An episode from another program or another database, to be imported.
 
     Attributes:
-        episode: Setting, task, seed and repeat in the study.
+        episode: Setting, task and seed in the study.
         row: Columns of the table `episodes`, as far as they are known.
         decodes: Decodes of the episode, a table with the columns of rows.DECODE_SCHEMA.
         block: Id of the block (episodes that one process ran) in which it ran.
@@ -80,7 +80,7 @@ def _same_episode() -> sa.ColumnElement[bool]:
     WANTED joined to SETTINGS has the planned episodes. EPISODES has the stored episodes.
     """
     of_setting = EPISODES.c.work == SETTINGS.c.work, EPISODES.c.task == WANTED.c.task
-    return sa.and_(*of_setting, EPISODES.c.seed == WANTED.c.seed, EPISODES.c.repeat == WANTED.c.repeat)
+    return sa.and_(*of_setting, EPISODES.c.seed == WANTED.c.seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,7 +257,7 @@ class Study:
         """
         stored: dict[Key, list[StoredEpisode]] = {}
         columns = (
-            EPISODES.c.work, EPISODES.c.task, EPISODES.c.seed, EPISODES.c.repeat, EPISODES.c.id, EPISODES.c.success,
+            EPISODES.c.work, EPISODES.c.task, EPISODES.c.seed, EPISODES.c.id, EPISODES.c.success,
             EPISODES.c.wall_seconds, BLOCKS.c.id, BLOCKS.c.run, BLOCKS.c.started, BLOCKS.c.code, BLOCKS.c.seeds,
         )  # fmt: skip
         works = {setting.work for setting in (block or self).settings}
@@ -270,8 +270,8 @@ class Study:
             query = query.outerjoin(RUNS, RUNS.c.id == BLOCKS.c.run)
             query = query.where(sa.func.coalesce(RUNS.c.kind, "") != ROLLOUT)
         with self.database.reading() as connection:
-            for work, task, seed, repeat, *row in connection.execute(query.order_by(EPISODES.c.id)):
-                stored.setdefault((work, task, seed, repeat), []).append(StoredEpisode(*row))
+            for work, task, seed, *row in connection.execute(query.order_by(EPISODES.c.id)):
+                stored.setdefault((work, task, seed), []).append(StoredEpisode(*row))
         return stored
 
     def _earlier(self) -> dict[str, tuple[Setting, str]]:
@@ -286,7 +286,7 @@ class Study:
         """Write the study's settings and its list of planned episodes.
 
         A study that is stored already may list episodes of tasks that are not in this plan. These episodes stay in the
-        list if their setting and the baseline are unchanged, and this plan has their seeds and repeats. So sweeps of
+        list if their setting and the baseline are unchanged, and this plan has their seeds. So sweeps of
         one study over different tasks give one report.
         """
         with self.database.writing() as connection:
@@ -307,11 +307,10 @@ class Study:
         for position, setting in enumerate(self.settings):
             ids[setting.label] = _save_setting(connection, row.id, position, setting)
             planned = of_label.get(setting.label, [])
-            seeds, repeats = list(map(attrgetter("seed"), planned)), map(attrgetter("repeat"), planned)
+            seeds = list(map(attrgetter("seed"), planned))
             still = sa.and_(
                 WANTED.c.task.not_in(self.tasks),
                 WANTED.c.seed.between(min(seeds, default=0), max(seeds, default=-1)),
-                WANTED.c.repeat <= max(repeats, default=-1),
             )
             of_setting = WANTED.c.setting_id == ids[setting.label]
             connection.execute(sa.delete(WANTED).where(of_setting, sa.not_(still)))
@@ -319,7 +318,7 @@ class Study:
         rows, first = [], (connection.scalar(last) or 0) + 1
         for position, one in enumerate(dict.fromkeys(self.episodes), first):
             stored = self.existing.get(one)
-            key = {"setting_id": ids[one.setting.label], "task": one.task, "seed": one.seed, "repeat": one.repeat}
+            key = {"setting_id": ids[one.setting.label], "task": one.task, "seed": one.seed}
             rows.append({**key, "position": position, "episode_id": stored and stored.id})
         if rows:
             connection.execute(sa.insert(WANTED), rows)
@@ -345,7 +344,7 @@ class Study:
     def whole_runs(self) -> list[str]:
         """Return the ids of the commands that each ran all episodes of the study, oldest first."""
         wanted = PLANNED.join(EPISODES, _same_episode()).join(BLOCKS)
-        keys = WANTED.c.setting_id, WANTED.c.task, WANTED.c.seed, WANTED.c.repeat
+        keys = WANTED.c.setting_id, WANTED.c.task, WANTED.c.seed
         ran = (
             sa.select(BLOCKS.c.run, *keys).distinct().select_from(wanted).where(STUDIES.c.name == self.name).subquery()
         )
@@ -355,7 +354,7 @@ class Study:
             return sorted(connection.scalars(whole))
 
     def frame(self, episodes: Iterable[Episode] | None = None, run: str | None = None) -> pd.DataFrame:
-        """Return the episodes that have been run, in the study's order: one row per label, task, seed and repeat.
+        """Return the episodes that have been run, in the study's order: one row per label, task and seed.
 
         Its columns are those of the table `episodes`, with `decode_seconds` as an array. Further columns are `run`,
         `code`, and the machine and versions that ran the episode.
@@ -372,7 +371,7 @@ class Study:
         with self.database.reading() as connection, self.database.checking(f"episodes of {self.name}"):
             query = (
                 sa.select(
-                    SETTINGS.c.label, WANTED.c.task, WANTED.c.seed, WANTED.c.repeat, EPISODES.c.id.label("episode"),
+                    SETTINGS.c.label, WANTED.c.task, WANTED.c.seed, EPISODES.c.id.label("episode"),
                     *measures_in(connection), *circumstances, BLOCKS.c.run, BLOCKS.c.code, BLOCKS.c.about,
                 )
                 .select_from(PLANNED.join(EPISODES, which).join(BLOCKS))
@@ -389,8 +388,8 @@ class Study:
             frame["decode_seconds"] = frame["decode_seconds"].map(lambda blob: np.frombuffer(blob, "<f8"))
             about = pd.DataFrame(list(frame.pop("about")), index=frame.index)
         if episodes is not None:
-            chosen = [(one.setting.label, one.task, one.seed, one.repeat) for one in episodes]
-            mine = pd.MultiIndex.from_frame(frame[["label", "task", "seed", "repeat"]]).isin(chosen)
+            chosen = [(one.setting.label, one.task, one.seed) for one in episodes]
+            mine = pd.MultiIndex.from_frame(frame[["label", "task", "seed"]]).isin(chosen)
             frame, about = frame[mine], about[mine]
         return pd.concat([frame, about], axis=1).reset_index(drop=True)
 
@@ -449,8 +448,8 @@ class Study:
             row: Columns of the table `episodes` whose values are neither in `one` nor in `block`.
             decodes: The episode's decodes, as the bytes of a Parquet file.
         """
-        work, task, seed, repeat = one.key
-        key = {"work": work, "task": task, "seed": seed, "repeat": repeat, "block": block["id"]}
+        work, task, seed = one.key
+        key = {"work": work, "task": task, "seed": seed, "block": block["id"]}
         number = connection.scalar(sa.select(EPISODES.c.id).filter_by(**key))
         if number is None:
             if connection.scalar(sa.select(BLOCKS.c.id).filter_by(id=block["id"])) is None:
@@ -467,7 +466,7 @@ class Study:
         """
         settings = sa.select(SETTINGS.c.id).join(STUDIES).where(STUDIES.c.name == self.name)
         settings = settings.where(SETTINGS.c.work == one.setting.work)
-        same = sa.update(WANTED).filter_by(task=one.task, seed=one.seed, repeat=one.repeat)
+        same = sa.update(WANTED).filter_by(task=one.task, seed=one.seed)
         connection.execute(same.where(WANTED.c.setting_id.in_(settings)).values(**values))
 
     def remove(self) -> None:
@@ -533,7 +532,7 @@ def stored_settings(connection: sa.Connection, study: int) -> tuple[dict[int, Se
     """Return a study's settings by their ids, and its episodes. `study` is the study's row number."""
     query = sa.select(SETTINGS).where(SETTINGS.c.study_id == study).order_by(SETTINGS.c.position)
     settings = {one.id: setting_of(one) for one in connection.execute(query)}
-    wanted = sa.select(WANTED.c.setting_id, WANTED.c.task, WANTED.c.seed, WANTED.c.repeat)
+    wanted = sa.select(WANTED.c.setting_id, WANTED.c.task, WANTED.c.seed)
     wanted = wanted.where(WANTED.c.setting_id.in_(settings)).order_by(WANTED.c.position)
     return settings, tuple(Episode(settings[number], *rest) for number, *rest in connection.execute(wanted))
 

@@ -79,7 +79,7 @@ def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], ki
         del plain["task"]
         settings.append(Setting(label, " ".join(point.overrides), plain, identity, point.varies, point.name))
     settings.sort(key=lambda setting: setting.label != about.baseline)
-    episodes = all_episodes(settings, resolved.tasks, about.block, about.repeats)
+    episodes = all_episodes(settings, resolved.tasks, about.block)
     own = {name: getattr(about, name) for name in ABOUT}
     study = Study(database, about.name, kind, tuple(settings), episodes, **own)
     if kind == SWEEP:
@@ -265,7 +265,7 @@ class Progress:
         return ended
 
     def _failed(self) -> list[SettingFailed]:
-        columns = (SETTINGS.c.work, WANTED.c.task, WANTED.c.seed, WANTED.c.repeat, WANTED.c.error)
+        columns = (SETTINGS.c.work, WANTED.c.task, WANTED.c.seed, WANTED.c.error)
         query = sa.select(*columns).select_from(PLANNED).order_by(WANTED.c.position)
         query = query.where(STUDIES.c.name == self.study.name, WANTED.c.error.is_not(None))
         failed: dict[tuple[str, str, str], dict[Episode, None]] = {}

@@ -188,18 +188,18 @@ def _interval(change: Estimate, what: str) -> Row:
 def same_tokens(first: Study, second: Study) -> tuple[int, int]:
     """Return two counts: shared episodes with equal tokens, and all shared episodes.
 
-    An episode is shared if both studies have an episode with the same label, task, seed and repeat.
+    An episode is shared if both studies have an episode with the same label, task and seed.
 
     Raises:
         UsageError: A study has no episode.
     """
-    shared = _tokens(first).merge(_tokens(second), on=["label", "task", "seed", "repeat"])
+    shared = _tokens(first).merge(_tokens(second), on=["label", "task", "seed"])
     return int((shared["tokens_x"] == shared["tokens_y"]).sum()), len(shared)
 
 
 def _tokens(store: Study) -> pd.DataFrame:
-    """Return a row per episode: label, task, seed, repeat, and the tokens of all its decodes."""
-    frame = store.frame()[["episode", "label", "task", "seed", "repeat"]]
+    """Return a row per episode: label, task, seed, and the tokens of all its decodes."""
+    frame = store.frame()[["episode", "label", "task", "seed"]]
     decodes = store.decodes(frame["episode"].tolist(), ["tokens"]).to_pandas()  # `episode` is a position in the list
     tokens = decodes.groupby("episode")["tokens"].agg(lambda rows: tuple(map(tuple, rows)))
     return frame.assign(tokens=tokens.reindex(range(len(frame))).to_list())

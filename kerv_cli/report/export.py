@@ -65,7 +65,7 @@ def _to_parquet(store: Study, frame: pd.DataFrame, folder: Path) -> list[Path]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    keys = ["label", "task", "seed", "repeat"]
+    keys = ["label", "task", "seed"]
     episodes, decodes = folder / "episodes.parquet", folder / "decodes.parquet"
     with atomic_path(episodes) as path:
         table = pa.Table.from_pandas(frame.drop(columns=["episode", "decode_seconds"]), preserve_index=False)
@@ -102,13 +102,13 @@ def _to_trace(store: Study, frame: pd.DataFrame, path: Path) -> None:
 
 
 def _decodes(store: Study, episodes: pd.DataFrame, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yield the decodes of some episodes as dictionaries. The key `episode` has the text TASK/SEED/REPEAT.
+    """Yield the decodes of some episodes as dictionaries. The key `episode` has the text TASK/SEED.
 
     A hundred episodes are read at a time.
     """
     for start in range(0, len(episodes), _AT_ONCE):
         some = episodes.iloc[start : start + _AT_ONCE]
-        names = [f"{task}/{seed}/{repeat}" for task, seed, repeat in some[["task", "seed", "repeat"]].to_numpy()]
+        names = [f"{task}/{seed}" for task, seed in some[["task", "seed"]].to_numpy()]
         for row in store.decodes(list(some["episode"]), columns).to_pylist():
             yield {**row, "episode": names[row["episode"]]}
 

@@ -148,7 +148,6 @@ class Result:
         tasks: Number of tasks.
         difficulty: Difficulty groups of the tasks.
         seeds: Seeds of the episodes, as `seeds_text` writes them.
-        repeats: How often every episode was measured.
         episodes: Number of episodes.
         baseline: Label of the setting that this setting is compared with.
         measures: Measured values.
@@ -173,7 +172,6 @@ class Result:
     tasks: int
     difficulty: str
     seeds: str
-    repeats: int
     episodes: int
     baseline: str
     measures: Measures
@@ -290,8 +288,7 @@ def measure(
         episodes, pairs = episodes.assign(difficulty=""), pairs.assign(difficulty="")
     by, outcomes, added = _GROUPS[averaging], list(PairedCounts._fields), list(ColumnPart.every())
     parts = [*by, "difficulty"]
-    worlds = episodes["repeat"] == 0  # a repeat measures the same world again
-    counted = episodes.assign(worlds=worlds, successes=worlds & episodes["success"].astype(bool))
+    counted = episodes.assign(worlds=1, successes=episodes["success"].astype(bool))
     counts = counted.groupby(parts)[["successes", "worlds", "steps", "decodes", "deviation_count"]].sum()
     counts = counts.join(pairs.groupby(parts)[outcomes].sum()).fillna(0).astype(int)
     means = _means(episodes, parts).groupby(level=by).mean().join(pairs.groupby(by)[["same_run", "same_block"]].mean())
@@ -343,7 +340,7 @@ def compared(counts: PairedCounts, difference: Estimate) -> dict[str, Any]:
 def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame:
     """Pair each setting's episodes with the episodes of its baseline.
 
-    Two episodes form a pair if they have the same task, seed, repeat, initial state, device, number format and number
+    Two episodes form a pair if they have the same task, seed, initial state, device, number format and number
     of threads. Episodes from another project's policy server name no device. They pair with episodes of any device.
 
     Args:
@@ -351,16 +348,15 @@ def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame
         baselines: Maps a setting's label to the label of its baseline. Settings without a baseline are left out.
 
     Returns:
-        One row per pair, sorted by task, seed and repeat. It has these columns:
+        One row per pair, sorted by task and seed. It has these columns:
 
-        - `label`, `task`, `difficulty`, `seed`, `repeat`, `decodes` (whether the setting runs a decoder), `same_run`
+        - `label`, `task`, `difficulty`, `seed`, `decodes` (whether the setting runs a decoder), `same_run`
           and `same_block`
         - for each of the two episodes, with the ending _baseline or _method: `time` (seconds per control step),
           `seconds` (of the whole episode), `block` and `success`
-        - the four outcomes of `PairedCounts`: 1 for the outcome of this pair, 0 for the three other outcomes. All four
-          are 0 in repeats, which measure the same initial state again.
+        - the four outcomes of `PairedCounts`: 1 for the outcome of this pair, 0 for the three other outcomes.
     """
-    keys = ["task", "seed", "repeat"]
+    keys = ["task", "seed"]
     columns = ["label", *keys, "run", "block", "success", "seconds", "initial_state", *COMPARABLE]
     other = episodes[columns].assign(time=episodes["seconds"] / episodes["steps"])
     method = other.assign(
@@ -376,14 +372,13 @@ def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame
         agree &= elsewhere | (both[f"{name}_method"] == both[f"{name}_baseline"])
     both = both[agree].sort_values(keys, kind="stable").reset_index(drop=True)
     won, reference = both["success_method"].astype(bool), both["success_baseline"].astype(bool)
-    counts = both["repeat"] == 0
     return both.assign(
         same_run=both["run_method"] == both["run_baseline"],
         same_block=both["block_method"] == both["block_baseline"],
-        both=(counts & won & reference).astype(int),
-        only_baseline=(counts & ~won & reference).astype(int),
-        only_method=(counts & won & ~reference).astype(int),
-        neither=(counts & ~won & ~reference).astype(int),
+        both=(won & reference).astype(int),
+        only_baseline=(~won & reference).astype(int),
+        only_method=(won & ~reference).astype(int),
+        neither=(~won & ~reference).astype(int),
     )
 
 
@@ -433,8 +428,6 @@ def speedups(pairs: pd.DataFrame, averaging: str = MICRO, all_pairs: bool = Fals
     """
     timed = pairs if all_pairs else pairs[pairs["same_block"]]
     blocks = timed["block_method"].astype(str) + "|" + timed["block_baseline"].astype(str)
-    # repeats of a world count once
-    blocks = blocks.groupby([timed["label"], timed["task"], timed["seed"]]).transform("first")
     tasks, clusters = pd.factorize(timed["task"])[0], pd.factorize(blocks)[0]
     difficulties = pd.factorize(timed["difficulty"])[0] if averaging == MACRO else np.zeros(len(timed), int)
     decodes = timed["decodes"].to_numpy()

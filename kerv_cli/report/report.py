@@ -264,7 +264,7 @@ def further_of(data: StudyData) -> dict[str, Any]:
             "provenance": {name: runtime[name] for name in RUNTIME} | dict(row.provenance),
             "measures": {},
         }
-        values: Row = {"tasks": row.tasks, "difficulty": row.difficulty, "repeats": row.repeats}
+        values: Row = {"tasks": row.tasks, "difficulty": row.difficulty}
         for name, value in columns_of(vars(row.measures)).items():
             if name not in CSV_COLUMNS:
                 is_finite = not isinstance(value, float) or math.isfinite(value)
@@ -375,7 +375,7 @@ def _films(data: StudyData) -> list[dict[str, Any]]:
     """
     if not has_rerun():
         return []
-    keys = ["label", "task", "seed", "repeat"]
+    keys = ["label", "task", "seed"]
     outcomes = data.episodes.set_index(keys)["success"].to_dict()
     films: dict[tuple[str, bool], dict[str, Any]] = {}
     for one in data.study.episodes:

@@ -307,7 +307,7 @@ def task_table(results: Sequence[Result]) -> pd.DataFrame:
     """
     cells: dict[str, dict[str, str]] = {}
     for row in results:
-        cell, speed = f"{row.measures.successes}/{row.episodes // row.repeats}", row.measures.episode_speedup.value
+        cell, speed = f"{row.measures.successes}/{row.episodes}", row.measures.episode_speedup.value
         if not row.is_baseline and is_number(speed):
             cell += f" · {speed:.2f}×"
         cells.setdefault(row.label, {})[row.task] = cell

@@ -59,7 +59,7 @@ class StudyData:
 
     Attributes:
         study: The settings, and the episodes that the study asks for.
-        episodes: One row per stored episode (label, task, seed and repeat). Columns: those of `Study.frame`, and
+        episodes: One row per stored episode (label, task and seed). Columns: those of `Study.frame`, and
             difficulty, device, number format and threads.
         runs: One table like `episodes` per run. A run is one command, such as one `kerv sweep`. All runs used the same
             code on the same kind of device. If `same_pairs` is true, each run measured all episodes of the study. If it
@@ -90,7 +90,7 @@ class StudyData:
     @property
     def absent(self) -> list[Episode]:
         """Episodes that the study asks for and that have not been stored yet."""
-        present = set(self.episodes[["label", "task", "seed", "repeat"]].itertuples(index=False, name=None))
+        present = set(self.episodes[["label", "task", "seed"]].itertuples(index=False, name=None))
         return [one for one in self.study.episodes if (one.setting.label, *one.key[1:]) not in present]
 
     @functools.cached_property
@@ -292,7 +292,7 @@ def _results(data: StudyData, averaging: str) -> list[Result]:
     """
     speeds = speedups_of_runs(data.pairs_of_runs, averaging, data.same_pairs)
     measured = measure(data.episodes, data.pairs, averaging, speeds)
-    texts = data.episodes.reindex(columns=["label", "task", "difficulty", "seed", "repeat", *_PROVENANCE])
+    texts = data.episodes.reindex(columns=["label", "task", "difficulty", "seed", *_PROVENANCE])
     texts = texts.astype(object).where(texts.notna(), None)
     where = texts["task"] if averaging == ONE_TASK else pd.Series("", texts.index)
     ordered = pd.Categorical(texts["label"], data.labels)
@@ -316,7 +316,6 @@ def _results(data: StudyData, averaging: str) -> list[Result]:
             tasks=part["task"].nunique(),
             difficulty=_joined(sorted(set(part["difficulty"]))),
             seeds=seeds_text(part["seed"].unique()),
-            repeats=part["repeat"].nunique(),
             episodes=len(part),
             baseline=data.references[label],
             measures=measured[(task, label) if averaging == ONE_TASK else label],
