@@ -65,14 +65,12 @@ def test_early_and_retrieved_drafts_have_costs_and_others_take_what_was_recorded
 def test_a_skipped_decode_has_no_forward():
     found = work(("skip", 0, 0, 16, "early"))
     assert found.needs == ["encode", "early"]
-    blind = work(("skip", 0, 0, 16, "scout"), vision=0.0)  # the target never encoded
-    assert (blind.needs, blind.propose.tolist(), blind.host.tolist()) == (["scout"], [0.5], [0.375])
+    blind = work(("skip", 0, 0, 16, "hold"), vision=0.0)  # the target never encoded
+    assert (blind.needs, blind.propose.tolist(), blind.host.tolist()) == ([], [0.5], [0.375])
     profile = Profile(31, {"encode": ((1,), (9.0,))})
     assert prices(blind, profile).tolist() + prices(found, profile).tolist() == [0.875, 9.875]
-    scout = Profile(31, {**profile.phases, "scout": ((1,), (0.25,))})
-    assert prices(blind, scout).tolist() == [0.625]
-    asked = work(("verify", 0, 15, 15, "scout"))  # the target verifies, so it encodes
-    assert asked.needs == ["encode", "prefill", "scout"]
+    asked = work(("verify", 0, 15, 15, "early"))  # the target verifies, so it encodes
+    assert asked.needs == ["encode", "prefill", "early"]
 
 
 def test_a_tree_has_the_levels_of_its_settings_and_of_the_chunk():
@@ -150,7 +148,7 @@ def test_a_draft_that_cannot_be_measured_is_named_and_the_others_are_measured(mo
         return settings.method
 
     monkeypatch.setattr(measuring, "decoder_for", without_early)
-    assert set(measuring.source_decoders(NANO)) == {"retrieval", "scout"}
+    assert set(measuring.source_decoders(NANO)) == {"retrieval"}
     assert "'early': no early drafter" in caplog.text
 
 

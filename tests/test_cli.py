@@ -412,7 +412,6 @@ ANSWERS = [
     ("serve method=heisd", "its calibration or drafts differ between tasks: name one with task=NAME"),
     ("serve method=spec_vla proposer=retrieval task=rech", "unknown task 'rech': did you mean reach-v3?"),
     ("serve policy=expert", "policy=expert: it needs the simulator and cannot be served"),
-    ("prepare policy=state for=scout_unverified", "needs a target that sees"),
     ("prepare policy=parallel", "decodes all tokens at once"),
     ("train drafter drafter=erly", "unknown drafter 'erly': did you mean early"),
     ("train drafter drafter.kind=early", "drafter.kind=early: choose drafter=early, each has settings of its own"),

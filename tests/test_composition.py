@@ -180,7 +180,6 @@ def test_a_threshold_that_nothing_reads_may_be_batched():
         ("method=one_pass prefill_draft.sources=[damped]", ("calibration",)),
         ("method=one_pass prefill_draft.sources=[early] prefill_draft.fallback=[retrieval]", ("early", "datastore")),
         ("method=one_pass skip=similarity skip.s_min=0.99", ("early", "datastore")),
-        ("method=scout_unverified", ("scout",)),
         ("method=sp_vla", ()),
     ],
 )
@@ -205,7 +204,7 @@ def test_a_method_needs_what_its_parts_read_and_nothing_else(overrides, wanted):
         ("method=spec_vla policy.artifacts.drafter=mine", ""),
         ("method=spec_vla datastore=exact", "datastore=exact"),
         ("method=early_unverified rectifier=compensate", "rectifier=compensate"),
-        ("method=one_pass_streak prefill_draft=scout skip=always rectifier=compensate", "rectifier=compensate"),
+        ("method=one_pass_streak prefill_draft=early skip=always rectifier=compensate", "rectifier=compensate"),
         ("method=one_pass_streak prefill_draft=hold skip=always rectifier=compensate", ""),
         ("method=ar runtime.workers=4", "runtime.workers=4"),
         ("method=ar record=0 record_size=64", "record_size=64"),

@@ -220,7 +220,7 @@ def test_a_target_that_decodes_in_parallel_takes_no_drafts(results, command):
 
 
 def test_a_method_needs_no_more_than_its_parts_read():
-    assert needs(("one_pass",), sees=True) == ("early",)
+    assert needs(("one_pass",)) == ("early",)
 
 
 def test_a_training_draws_its_curves(results):
@@ -249,7 +249,7 @@ def test_a_wrong_target_is_noticed_before_anything_else(command):
 @pytest.mark.parametrize(
     ("words", "command"),
     [
-        ("policy.artifacts.scout=m method=scout_unverified", "train drafter drafter=scout policy.target=mt10-vision"),
+        ("policy.artifacts.early=m method=early_unverified", "train drafter drafter=early policy.target=mt10-vision"),
     ],
 )
 def test_a_missing_artifact_with_a_name_is_answered_with_the_command_that_makes_it(words, command, tmp_path):

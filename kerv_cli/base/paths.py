@@ -156,7 +156,7 @@ def check_not_shipped(path: Path, word: str) -> None:
 
     Args:
         path: Folder to write to.
-        word: Setting that chooses another folder, such as `policy.artifacts.scout`. Text for the error message.
+        word: Setting that chooses another folder, such as `policy.artifacts.drafter`. Text for the error message.
 
     Raises:
         UsageError: The folder belongs to a shipped policy, and holds no artifact that the user has trained.

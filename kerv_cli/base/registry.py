@@ -230,15 +230,13 @@ class DrafterPart(ProposerPart):
 
     Args:
         trained: Dataclass of the settings for the drafter's shape and training.
-        sees: Whether the drafter needs a target that reads images.
     """
 
     trained: type
-    sees: bool = False
 
     def add(self) -> None:
         """Register the artifact and the proposer."""
-        ArtifactPart(self.name, self.trained, sees=self.sees, code=self.code).add()
+        ArtifactPart(self.name, self.trained, code=self.code).add()
         super().add()
 
     def needed(self, settings: Any) -> tuple[str, ...]:
@@ -324,14 +322,12 @@ class ArtifactPart(Part):
     """A kind of artifact. The decorated function returns the subclass of `Artifact` that makes and loads it.
 
     Args:
-        sees: Whether the artifact needs a target that reads images.
         by_task: Whether it contains separate numbers or data for each task.
         needs_task: Whether it can be used only for tasks that it contains.
         described_by: Name of the file that describes the artifact. If empty, it is `<kind>.json`.
     """
 
     kind = "artifact"
-    sees: bool = False
     by_task: bool = False
     needs_task: bool = False
     described_by: str = ""

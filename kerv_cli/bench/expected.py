@@ -29,12 +29,10 @@ class Drafts:
     Attributes:
         depth: Largest number of tokens in a drafted chain, or of levels in a tree. 0 if the method uses no drafter.
         nodes: Largest number of nodes of a drafted tree. 0 if the drafter drafts chains.
-        source: What drafts once per decode, instead of the drafter or in addition to it: `early`, `scout` or
-            `retrieval`. Empty if only the drafter drafts.
+        source: What drafts once per decode, instead of the drafter or in addition to it: `early` or `retrieval`. Empty if only the drafter drafts.
         in_prefill: Whether the prefill verifies the draft of `source`.
         retrieved: Share of the verified decodes in which `source` drafts instead of the drafter.
         skipped: Share of the decodes that execute the draft of `source` unverified.
-        encodes: Whether an unverified draft needs the target's encoder.
     """
 
     depth: int = 0
@@ -43,7 +41,6 @@ class Drafts:
     in_prefill: bool = False
     retrieved: float = 0.0
     skipped: float = 0.0
-    encodes: bool = True
 
 
 class Means(NamedTuple):
@@ -87,8 +84,7 @@ class Decodes:
             acceptance: Probability that the first, second, … token of a draft is accepted; see `verified`.
         """
         share = self.drafts.skipped
-        encoder = self._cost("encode", 1) * self.drafts.encodes
-        unverified = self._source + encoder if share else 0.0
+        unverified = self._source + self._cost("encode", 1) if share else 0.0
         seconds = self.verified(acceptance).seconds if share < 1 else 0.0
         return (1 - share) * seconds + share * unverified
 
@@ -198,7 +194,7 @@ def _least(enough: Callable[[float], bool]) -> float:
 TABLES = {"papers": 4, "papers_libero": 7, "main": 16}
 """The published tables in results/tables, each with N, the number of tokens per chunk in the table's decodes."""
 
-_SOURCES = {"merged": "early", "early": "early", "scout": "scout", "retrieval": "retrieval"}
+_SOURCES = {"merged": "early", "early": "early", "retrieval": "retrieval"}
 _DRAFTERS = ("drafter", "hybrid")
 
 
@@ -276,5 +272,4 @@ def _drafts(settings: Mapping[str, Any], skipped: float, retrieved: float) -> Dr
         in_prefill=bool(source) and not hybrid,
         retrieved=max(searched, 0.0),
         skipped=skipped,
-        encodes=source != "scout",
     )

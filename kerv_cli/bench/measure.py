@@ -39,7 +39,7 @@ from kerv_cli.engine.tree import ROOT
 from kerv_cli.episodes.policy import decoder_for
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer
-from kerv_cli.methods.early.drafter import EarlyProposer, ScoutProposer
+from kerv_cli.methods.early.drafter import EarlyProposer
 from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.targets.compact.program import Program, stored_bytes
 from kerv_cli.targets.provenance import stamp
@@ -135,8 +135,8 @@ class Phase:
 
     Attributes:
         kind: encode, prefill, verify, feed (the drafter reads the target's hidden states), draft (the drafter drafts a
-            chain), tree (the drafter drafts a tree), or early, retrieval, scout (drafts made without the drafter). The
-            last three are measured with the shipped policy, because their time does not depend on the target's size.
+            chain), tree (the drafter drafts a tree), or early, retrieval (drafts made without the drafter). The
+            last two are measured with the shipped policy, because their time does not depend on the target's size.
         rows: Number of tokens in a forward or in a drafted chain. Depth of a drafted tree. 1 for the other kinds.
         seconds: Median of all repeats.
         p95: 95th percentile of all repeats.
@@ -314,8 +314,6 @@ def needs_of_draft(decoder: Any) -> tuple[float, float]:
         return 0.0, 0.0
     network: Any = draft.early
     given: Any = torch.zeros(1, target.pooled_width)
-    if isinstance(draft, ScoutProposer):
-        network, given = draft.scout, draft.inputs(blank(target))
     with FlopCounterMode(display=False) as counter:
         copy.deepcopy(network)(given)  # a copy is not compiled
     return stored_bytes(network.parameters()), float(counter.get_total_flops())
@@ -327,7 +325,7 @@ def source_methods() -> dict[str, str]:
 
 
 def source_decoders(settings: BenchSettings) -> dict[str, Any]:
-    """Return decoders of the shipped policy that measure the drafts `early`, `retrieval` and `scout`, by these names.
+    """Return decoders of the shipped policy that measure the drafts `early` and `retrieval`, by these names.
 
     The time of these drafts does not depend on the size of the target. A draft that cannot be measured, for example
     because its drafter is missing, is left out, and a warning says why.

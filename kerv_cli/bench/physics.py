@@ -243,7 +243,7 @@ class Shape:
         layers: Number of the trunk's layers.
         prompt: P, number of prompt tokens.
         parts: Needs of each phase that runs at most once per decode. The keys are kinds of phase: `encode` (vision
-            towers and projector), `early`, `scout`, `retrieval`.
+            towers and projector), `early`, `retrieval`.
     """
 
     name: str
@@ -332,13 +332,11 @@ def vla_shape(name: str, language: Language, prompt: int, encoder: Needs) -> Sha
     """
     width, sizes = language.hidden_size, Sizes.of(language, _HALF)
     # The early drafter reads two pooled vectors, has two blocks of 384 units and spreads 32 features over 7 tokens. Its
-    # kernels and the scout's are counted in the shipped drafters, the scout's other figures, too. A datastore has the
-    # shipped one's 45,221 keys of 32 numbers.
+    # kernels are counted in the shipped drafter. A datastore has the shipped one's 45,221 keys of 32 numbers.
     early = 2 * width * 384 + 6 * 384**2 + 384 * 7 * 32 + 32 * 256
     parts = {
         "encode": encoder,
         "early": Needs(_HALF * early, 2.0 * early, kernels=57),
-        "scout": Needs(_HALF * 1.253e6, 30.2e6, kernels=121),
         "retrieval": Needs(_HALF * 45_221 * 32, 2.0 * 45_221 * 32, kernels=10),
     }
     return Shape(name, sizes, language.num_hidden_layers, prompt, parts)

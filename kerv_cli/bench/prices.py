@@ -59,7 +59,6 @@ FAMILIES = (
     Family("one pass", "one_pass", Drafts(source="early", in_prefill=True)),
     Family("streak", "one_pass_streak", Drafts(15, source="early", in_prefill=True, skipped=1.0)),
     Family("unverified", "early_unverified", Drafts(source="early", skipped=1.0)),
-    Family("unverified, own encoder", "scout_unverified", Drafts(source="scout", skipped=1.0, encodes=False)),
 )
 """Families of methods. The published length is Spec-VLA's, as HeiSD quotes it (docs/methods.md §2.3)."""
 ACTION = 7

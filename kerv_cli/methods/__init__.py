@@ -3,7 +3,7 @@
     ar                          autoregressive decoding (AR): no drafts
     spec_vla                    Spec-VLA: accept a draft token that equals the target's token, or is at most r bins off
     eagle                       EAGLE-2: our own and published drafters, which read the target's hidden states
-    early                       ours: the early drafter and the scout draft a chunk before the prefill
+    early                       ours: the early drafter drafts a chunk before the prefill
     kerv                        KERV: predictions from the motion, and thresholds that follow the motion
     unverified                  tokens without verification: OpenVLA-OFT's parallel pass, drafts, SP-VLA's regression
     heisd                       HeiSD: retrieved drafts, a boundary between two drafters, skipped verification

@@ -4,7 +4,7 @@ A command opens one dataset, or several joined datasets.
 
 While demonstrations are recorded, the scripted expert or a policy acts. If a policy acts, the expert labels the states
 that the policy visits (DAgger; Ross, Gordon, Bagnell 2011). The policy may decode with any method. For example,
-`method=scout_unverified` records the states that a drafter's chunks lead to without verification, so that the drafter
+`method=early_unverified` records the states that a drafter's chunks lead to without verification, so that the drafter
 can be trained on them.
 """
 

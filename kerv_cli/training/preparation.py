@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from kerv_cli.base.config import compose, groups
-from kerv_cli.base.errors import CheckpointError, UsageError
+from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.registry import ArtifactPart
 from kerv_cli.catalogue.entries import artifact_entry
 from kerv_cli.episodes.settings import RolloutSettings
@@ -56,7 +56,7 @@ def plan(settings: PrepareSettings, database: Database) -> list[Step]:
     artifacts = Artifacts(settings.results, settings.policy)
     description = artifacts.description
     description.check_autoregressive(f"policy.target={settings.policy.target}", "it needs nothing more")
-    kinds = needs(tuple(settings.methods), bool(description.cameras))
+    kinds = needs(tuple(settings.methods))
     steps: list[Step] = []
     for kind in kinds:
         files = kind_of(kind)
@@ -72,28 +72,23 @@ def plan(settings: PrepareSettings, database: Database) -> list[Step]:
 
 
 @functools.cache
-def needs(methods: tuple[str, ...], sees: bool) -> tuple[str, ...]:
+def needs(methods: tuple[str, ...]) -> tuple[str, ...]:
     """Return the kinds of artifacts that the methods need, in the order in which they must be made.
 
     Args:
         methods: Names of methods. If empty, all methods that work with the target.
-        sees: Whether the target has cameras.
 
     Raises:
         UnknownName: A method does not exist.
-        UsageError: A method needs an artifact that only a target with cameras can have.
     """
     artifacts = ArtifactPart.every()
     kinds: set[str] = set()
     for name in methods or groups()["method"]:
-        needed = Method.of(compose("rollout", [f"method={name}"], RolloutSettings)).needs
-        if methods and not sees and any(artifacts[kind].sees for kind in needed):
-            raise UsageError(f"for={name}: it needs a target that sees, this one reads the state")
-        kinds.update(needed)
+        kinds.update(Method.of(compose("rollout", [f"method={name}"], RolloutSettings)).needs)
     order: list[str] = []
     for kind, part in artifacts.items():
         order += [*part.needed(None), kind]
-    possible = [kind for kind in dict.fromkeys(order) if kind in kinds and (sees or not artifacts[kind].sees)]
+    possible = [kind for kind in dict.fromkeys(order) if kind in kinds]
     return tuple(kind for kind in possible if kind_of(kind).command)
 
 

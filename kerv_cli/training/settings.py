@@ -128,7 +128,7 @@ class TrainDrafterSettings(DemonstrationSettings):
     # drafter comes after train, because drafter=early overrides some of train's settings
     groups: ClassVar = {"policy": "vision", "train": "drafter", "drafter": "drafter", "runtime": "auto"}
 
-    drafter: Any = setting(chosen("drafter", "drafter"), "kind, with shapes and loss: drafter (EAGLE-2), early, scout")
+    drafter: Any = setting(chosen("drafter", "drafter"), "kind, with shapes and loss: drafter (EAGLE-2), early")
     train: TrainSettings = setting(TrainSettings, "optimisation")
 
     def check_together(self, prefix: str) -> None:

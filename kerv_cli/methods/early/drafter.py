@@ -1,16 +1,9 @@
-"""The early drafter and the scout: networks, proposers and training (docs/methods.md §5, §5.1, ours).
+"""The early drafter: network, proposer and training (docs/methods.md §5, ours).
 
-The early drafter drafts a whole chunk from the encoded prompt, before the target's trunk runs. A residual network turns
-the pooled prompt into a few features per token, and one head turns the features into logits over the bins. So a chunk
-costs one small forward pass.
+It drafts a whole chunk from the encoded prompt, before the target's trunk runs. A residual network turns the pooled
+prompt into a few features per token, and one head turns the features into logits over the bins.
 
-The scout reads the image itself, beside the hand and the instruction. It needs nothing that the target computes. So
-chunks without verification never pay for the target's encoder, and a scout need not repeat an error of the target's
-encoder. Its own vision encoder (stem) and its estimate of the positions of object and goal feed the network of the
-early drafter.
-
-Shapes: B prompts or observations, F features, p numbers of proprioception, K estimated positions, N tokens of a chunk,
-V bins, which are the possible tokens.
+Shapes: B prompts, F features of a pooled prompt, N tokens of a chunk, V bins, which are the possible tokens.
 """
 
 from __future__ import annotations
@@ -24,7 +17,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.engine.batched import greedy
@@ -34,18 +26,10 @@ from kerv_cli.engine.protocol import JoinsDrafters, ReadableTarget
 from kerv_cli.engine.transfer import read
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.drafters import Decodes, Metrics, TrainableDrafter
-from kerv_cli.methods.early import EarlySettings, ScoutSettings
-from kerv_cli.targets.compact.features import VisionEncoder, hand_features, mlp, scene_features, scene_width
+from kerv_cli.methods.early import EarlySettings
 from kerv_cli.targets.compact.program import Compilable, Program
-from kerv_cli.targets.compact.target import CompactTarget, Inputs
-from kerv_cli.targets.losses import labels_of, position_loss, token_loss, within_chunk
-from kerv_cli.targets.observations import (
-    BATCH,
-    Observations,
-    observations_of,
-    prompts_of,
-    read_observations,
-)
+from kerv_cli.targets.losses import labels_of, token_loss, within_chunk
+from kerv_cli.targets.observations import observations_of, prompts_of
 from kerv_cli.worlds.demos.files import DemoEpisode
 
 SURE = 0.05
@@ -115,28 +99,12 @@ class EarlyNetwork(Compilable):
 
     @torch.inference_mode()
     def draft(self, features: Tensor, radius: int) -> Tensor:
-        """Draft chunks. The result stays on the device, so the CPU need not wait for a GPU.
-
-        Args:
-            features: (B, F) pooled prompts.
-            radius: Acceptance radius, in bins.
+        """Draft chunks for pooled prompts (B, F) and an acceptance radius in bins.
 
         Returns:
-            (B, N + 1) float64: the N tokens, then the estimated probability that all of them are accepted.
+            (B, N + 1) float64 on the device: the N tokens, then the estimated probability that all are accepted.
         """
-        return self.chosen(self(features.to(self.head.weight.dtype)), radius)
-
-    def chosen(self, logits: Tensor, radius: int) -> Tensor:
-        """Choose the tokens of chunks from logits.
-
-        Args:
-            logits: (B, N, V).
-            radius: Acceptance radius, in bins.
-
-        Returns:
-            (B, N + 1) float64: the N tokens, then the estimated probability that all of them are accepted.
-        """
-        tokens, odds = choose(logits, radius, self.strict)
+        tokens, odds = choose(self(features.to(self.head.weight.dtype)), radius, self.strict)
         return torch.cat([tokens.double(), odds.double()[:, None]], -1)
 
 
@@ -249,8 +217,7 @@ class EarlyDrafter(TrainableDrafter):
     """
 
     kind, noun = "early", "early drafter"
-    settings: type[Any] = EarlySettings
-    drafts_with: type[EarlyProposer] = EarlyProposer
+    settings = EarlySettings
 
     def network(self, settings: Any, target: Any) -> nn.Module:
         """Return a network with initial weights, for the target's action space, chunk length and pooled prompt."""
@@ -258,8 +225,8 @@ class EarlyDrafter(TrainableDrafter):
 
     @classmethod
     def proposer(cls, settings: NoSettings, context: Context) -> EarlyProposer:
-        """Build the proposer that drafts with the policy's early drafter, or with its scout."""
-        return cls.drafts_with(context.artifact(cls.kind), context.target)
+        """Build the proposer that drafts with the policy's early drafter."""
+        return EarlyProposer(context.artifact(cls.kind), context.target)
 
     def decoded(
         self, target: Any, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace, columns: dict[str, Tensor]
@@ -277,29 +244,15 @@ class EarlyDrafter(TrainableDrafter):
         """Set the mean and the scale by which the network standardises its inputs, from the training examples."""
         network.standardise(examples.features)
 
-    def outputs(self, network: Any, target: Any, batch: Any) -> tuple[Tensor, ...]:
-        """Run the network on a batch of B examples. The first output is the logits (B, N, V)."""
-        return (network(batch.features.to(target.device).float()),)
-
-    def token_loss(self, logits: Tensor, target: Any, batch: Decodes, settings: Any) -> Tensor:
-        """Return the cross-entropy of logits with soft labels, which spread each target token over neighbouring bins.
+    def loss(self, network: Any, target: Any, batch: Any, step: int, settings: Any) -> tuple[Tensor, Metrics]:
+        """Return the cross-entropy with soft labels, which spread each target token over neighbouring bins.
 
         Tokens after the end of a chunk are not counted.
-
-        Args:
-            logits: (B, N, V).
-            target: The target.
-            batch: The B training examples.
-            settings: Settings of `kerv train drafter`.
         """
         labels = _labels(target.actions, settings.train.label_sigma, target.device)
-        tokens = batch.tokens.to(target.device)
-        end = target.actions.end
-        return token_loss(logits, tokens, labels, None if end is None else within_chunk(tokens, end))
-
-    def loss(self, network: Any, target: Any, batch: Any, step: int, settings: Any) -> tuple[Tensor, Metrics]:
-        """Return the token loss of a batch, and metrics to log."""
-        loss = self.token_loss(self.outputs(network, target, batch)[0], target, batch, settings)
+        tokens, end = batch.tokens.to(target.device), target.actions.end
+        logits = network(batch.features.to(target.device).float())
+        loss = token_loss(logits, tokens, labels, None if end is None else within_chunk(tokens, end))
         return loss, {"token_loss": float(loss.detach())}
 
     def validate(self, network: Any, target: Any, held_out: Any, settings: Any) -> Metrics:
@@ -308,17 +261,11 @@ class EarlyDrafter(TrainableDrafter):
         All perturbed episodes (executed with noise) together weigh as much as all other episodes together. The score is
         the mean number of accepted tokens with strict acceptance, plus the mean number with the acceptance radius 9.
         """
-        chosen = torch.arange(len(held_out)).split(256)
-        outputs = [self.outputs(network, target, held_out.where(indices)) for indices in chosen]
-        logits, *rest = (torch.cat(parts).cpu() for parts in zip(*outputs, strict=True))
+        batches = held_out.features.split(256)
+        logits = torch.cat([network(batch.to(target.device).float()).cpu() for batch in batches])
         strict = torch.from_numpy(target.actions.strict_tokens(logits.shape[1]))
         metrics = measure(logits, held_out, strict, target.actions.end)
-        score = metrics["accepted_r9"] + metrics["accepted_strict"]
-        return {"score": score, **metrics, **self.further_metrics(target, held_out, *rest)}
-
-    def further_metrics(self, target: Any, held_out: Any, *outputs: Tensor) -> Metrics:
-        """Return metrics of the network's outputs other than the logits. The early drafter has no such outputs."""
-        return {}
+        return {"score": metrics["accepted_r9"] + metrics["accepted_strict"], **metrics}
 
 
 @functools.lru_cache(maxsize=1)
@@ -359,221 +306,3 @@ def measure(logits: Tensor, examples: Decodes, strict: Tensor, end: int | None =
     right = (logits.argmax(-1) == examples.tokens) & counted
     metrics["token_accuracy"] = balanced(right.sum(1) / sizes)
     return metrics
-
-
-# --- the scout (§5.1)
-
-
-class ScoutNetwork(Compilable):
-    """The network from an observation to the logits of a chunk (N tokens, V bins).
-
-    It also estimates the positions of the task's K places, such as object and goal.
-    """
-
-    centre: Tensor
-    compiled: Program | None
-
-    def __init__(self, settings: ScoutSettings, target: Any, views: int) -> None:
-        """Build the network.
-
-        Args:
-            settings: Shapes of the network.
-            target: The target.
-            views: Number of camera views in the image, side by side.
-        """
-        super().__init__()
-        s = self.settings = settings
-        observation = self.observation = target.observation
-        size = self.size = target.frame_shape[0]
-        self.register_buffer("centre", torch.tensor(observation.centre), persistent=False)
-        self.stems = nn.ModuleList(
-            VisionEncoder(size, s.grid, s.keypoints, s.channels, s.cell_width, "instance") for _ in range(views)
-        )
-        self.cells = nn.Linear(s.cell_width, s.cell_features)
-        self.words = nn.Embedding(target.words.size, s.word_width)
-        p, places = len(observation.proprioception), len(observation.places)
-        self.locate = mlp(2 * s.keypoints * views + p + s.word_width, 128, 64, 3 * places)
-        of_views = (s.cell_width + s.grid**2 * s.cell_features) * views
-        features = of_views + s.word_width + scene_width(observation)
-        self.drafter = EarlyNetwork(s, target.actions, target.chunk, features)
-
-    def forward(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
-        """Return the logits (B, N, V), and the estimated positions of object and goal (B, K, 3), in metres."""
-        given = self.views(inputs)
-        if self.compiled is not None and self.runs_compiled(*given):
-            logits, places = self.compiled(*given)
-            return logits, places
-        return self.network(*given)
-
-    def views(self, inputs: Inputs) -> list[Tensor]:
-        """Encode the images and the instructions of observations.
-
-        Returns:
-            The proprioception (B, p), the mean word embedding of the instruction (B, word width), and two tensors for
-            each camera view: features of the grid cells (B, cells, cell width), and image points (B, 2 · keypoints).
-        """
-        assert inputs.images is not None
-        found = [inputs.proprioception, self.words(inputs.words).mean(1)]
-        for stem, image in zip(self.stems, inputs.images.split(self.size, -1), strict=True):
-            found += stem(image)
-        return found
-
-    def see(self, proprioception: Tensor, words: Tensor, *views: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the drafter's input features, and estimate the positions of the task's places (object, goal).
-
-        Args:
-            proprioception: (B, p) proprioception.
-            words: (B, word width) mean word embedding of the instruction.
-            views: For each camera view its features and its image points, as the method `views` returns them.
-
-        Returns:
-            Features (B, F), and the positions (B, K, 3) in metres of K places, such as object and goal.
-        """
-        cells: list[Tensor] = []
-        for grid in views[::2]:
-            cells += grid.mean(1), self.cells(grid).flatten(1)
-        located = self.locate(torch.cat([*views[1::2], hand_features(proprioception, self.centre), words], -1))
-        places = located.unflatten(-1, (-1, 3)) * 0.1 + self.centre
-        scene = scene_features(proprioception, places, self.centre)
-        return torch.cat([*cells, words, scene], -1), places
-
-    def network(self, *given: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute the result of `forward` from the results of `views`, with the PyTorch modules."""
-        features, places = self.see(*given)
-        return self.drafter.logits(features.to(self.drafter.head.weight.dtype)), places
-
-    def new_program(self) -> Program:
-        """Return the compiled network, without its vision encoders."""
-        return Program(self.network, *self.shapes)
-
-    @property
-    def shapes(self) -> list[tuple[int, ...]]:
-        """Shapes of the tensors that `views` returns for one observation."""
-        s = self.settings
-        of_view = (1, s.grid**2, s.cell_width), (1, 2 * s.keypoints)
-        return [(1, len(self.observation.proprioception)), (1, s.word_width), *of_view * len(self.stems)]
-
-
-class ScoutProposer(EarlyProposer):
-    """Drafts chunks with the scout, once per observation. The target's encoder need not run."""
-
-    name = "scout"
-
-    def __init__(self, scout: ScoutNetwork, target: Any) -> None:
-        self.scout, self.inputs = scout, target.inputs
-        super().__init__(scout.drafter, target)
-
-    def compile(self) -> Program | None:
-        """Return a compiled program that computes the result of `row`. Return None if the scout is not compiled.
-
-        The program's inputs are a radius (1, 1) and the tensors that `ScoutNetwork.views` returns.
-        """
-        scout: Any = self.scout
-
-        def row(radius: Tensor, *views: Tensor) -> Any:
-            return scout.network(*views)[0].choose(radius, scout.drafter.strict)
-
-        return Program(row, (1, 1), *scout.shapes) if scout.compiled is not None else None
-
-    @torch.inference_mode()
-    def row(self, chunk: Chunk, radius: int) -> Tensor:
-        """Draft the tokens of a chunk from its observation, for the acceptance `radius` in bins.
-
-        Returns:
-            (N + 1,): the N tokens, then the estimated probability that all of them are accepted.
-        """
-        assert chunk.observation is not None
-        if self.compiled is not None:
-            return self.compiled(torch.tensor([[radius]]), *self.scout.views(self.inputs(chunk.observation)))[0][0]
-        return self.early.chosen(self.scout(self.inputs(chunk.observation))[0], radius)[0]
-
-
-@dataclass(frozen=True)
-class ScoutExamples(Observations, Decodes):
-    """The n training examples of a scout: observations, and the target's tokens and position estimates for them.
-
-    The positions are those of object and goal. The simulator's true positions are not used.
-    """
-
-    places: Tensor  # (n, K, 3) float32, positions estimated by the target, metres
-
-
-class ScoutDrafter(EarlyDrafter):
-    """Scouts: drafters with their own vision encoder, for targets with cameras. They are artifacts of the kind `scout`.
-
-    In the first `train.scene_steps` steps of the training, the scout learns only to estimate positions.
-    """
-
-    kind = noun = "scout"
-    settings = ScoutSettings
-    drafts_with = ScoutProposer
-
-    def network(self, settings: ScoutSettings, target: Any) -> ScoutNetwork:
-        """Return a network with initial weights, for the target's camera views.
-
-        Raises:
-            CheckpointError: The target has no camera.
-        """
-        height, width, _ = check_sees(target).frame_shape
-        return ScoutNetwork(settings, target, width // height)
-
-    def decoded(
-        self, target: Any, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace, columns: dict[str, Tensor]
-    ) -> ScoutExamples:
-        """Let the target decode observations of an episode, and return them as training examples.
-
-        An example's labels are the target's tokens, and the target's estimates of the positions of object and goal.
-        `TrainableDrafter.decoded` explains the arguments.
-
-        Raises:
-            CheckpointError: The target has no camera, or the images have another size than the target takes.
-        """
-        settings, chosen = check_sees(target).settings, np.searchsorted(episode.frame_steps, steps)
-        rows = read_observations(episode, settings, space, target.words, chosen)
-        tokens, places = [], []
-        for indices in torch.arange(len(rows)).split(BATCH):
-            prompt, located = target.encode_batch(rows.where(indices).inputs(target.device))
-            tokens.append(greedy(target, prompt)[0].cpu())
-            places.append(located.float().cpu())
-        return ScoutExamples(**(vars(rows) | columns), tokens=torch.cat(tokens), places=torch.cat(places))
-
-    def prepare(self, network: Any, examples: Any) -> None:
-        """Do nothing. The features cannot be standardised, because they change while the vision encoder is trained."""
-
-    def outputs(self, network: Any, target: Any, batch: Any) -> tuple[Tensor, ...]:
-        """Run the network on a batch of B examples. Return logits (B, N, V) and estimated positions (B, K, 3)."""
-        return network(batch.inputs(target.device))
-
-    def loss(self, network: Any, target: Any, batch: Any, step: int, settings: Any) -> tuple[Tensor, Metrics]:
-        """Return the loss of a batch, and metrics to log.
-
-        The loss is the token loss plus the weighted position loss. In the first `train.scene_steps` steps it is the
-        position loss alone.
-        """
-        train, labels = settings.train, batch.places.to(target.device)
-        if step < train.scene_steps:
-            loss = position_loss(network.see(*network.views(batch.inputs(target.device)))[1], labels)
-            return loss, {"position_loss": float(loss.detach())}
-        logits, places = self.outputs(network, target, batch)
-        token, position = self.token_loss(logits, target, batch, settings), position_loss(places, labels)
-        metrics = {"token_loss": float(token.detach()), "position_loss": float(position.detach())}
-        return token + train.scene_weight * position, metrics
-
-    def further_metrics(self, target: Any, held_out: Any, *outputs: Tensor) -> Metrics:
-        """Return the median error of each estimated position, in centimetres."""
-        error = (outputs[0] - held_out.places).norm(dim=-1).median(0).values
-        names = [place.name.replace(" ", "_") for place in target.observation.places]
-        return {f"{name}_error_cm": 100 * float(e) for name, e in zip(names, error, strict=True)}
-
-
-def check_sees(target: Any) -> CompactTarget:
-    """Return the target, if it has a camera and estimates positions.
-
-    Raises:
-        CheckpointError: The target has no camera, or estimates no positions.
-    """
-    if not isinstance(target, CompactTarget) or not getattr(target, "cameras", ()):
-        raise CheckpointError(
-            "a scout needs a target with a camera that locates object and goal (policy=vision); this one has none"
-        )
-    return target
