@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,14 +16,11 @@ from mock_target import SEVEN
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.paths import find_target, shipped_dir
-from kerv_cli.base.registry import find
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.context import Context
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early.drafter import EarlyDrafter
-from kerv_cli.methods.kerv import Contact, ContactThresholdSettings
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.methods.unverified import ParallelPass
 from kerv_cli.targets.attention import CapturedCache, attention_mask, bucket
@@ -219,27 +215,6 @@ def test_a_padded_prompt_changes_no_output(seed, prompt, draft, padding, fixed):
             outputs.append(torch.cat([first, rest], 1))
     for output in outputs[1:]:
         torch.testing.assert_close(output, outputs[0], rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", ["nano-vision", "nano-state"])
-def test_a_radius_by_contact_is_that_of_the_policys_own_estimate(policies, name):
-    """Decision by decision: linear in the distance from hand to object of the observation before, within 3 … 15."""
-    target, _ = load_target(find_target(str(policies), name))
-    chosen = find("threshold", "contact").built(ContactThresholdSettings(near=2.0), Context(target, lambda kind: None))
-    target.encode(observation(0))
-    chosen.reset()
-    assert chosen.radius() == 3, "nothing was read in this episode"
-    radii = []
-    for seed in range(12):
-        seen = observation(seed)
-        target.encode(seen)
-        place = target.encode_batch(target.inputs(seen))[1][0, 0].numpy()
-        distance = np.linalg.norm(np.asarray(seen.proprioception[:3], np.float32) - place)
-        radii.append(int(3 + 12 * min(1.0, float(distance) / 2.0) + 0.5))
-        assert chosen.radius() == radii[-1]
-    assert len(set(radii)) > 1
-    with refused("estimates no position", error=UsageError):
-        Contact(ContactThresholdSettings(), Context(SimpleNamespace(actions=target.actions), lambda kind: None))
 
 
 def test_a_shape_that_is_too_small_is_refused(policies):

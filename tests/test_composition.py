@@ -25,7 +25,6 @@ from kerv_cli.methods.eagle import DrafterProposerSettings
 from kerv_cli.methods.kerv import CompensateSettings, KinematicThresholdSettings
 from kerv_cli.methods.reuse import JacobiProposerSettings
 from kerv_cli.methods.spec_vla import FixedThresholdSettings, RelaxedAcceptanceSettings
-from kerv_cli.methods.unverified import SpeedSkipSettings
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -65,7 +64,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         "boundary": heisd.FusedBoundarySettings(alpha=0.5, window=15, quantile=0.25, f_star=None),
         "skip": heisd.SimilaritySkipSettings(s_min=-1.0, max_skips=2, up=0.0, down=0.0),
     },
-    "sp_vla": {"skip": SpeedSkipSettings(v_min=0.3, v_max=1000, buffer=6, share=0.5, penalty=1e-4)},
 }
 
 
@@ -180,7 +178,6 @@ def test_a_threshold_that_nothing_reads_may_be_batched():
         ("method=one_pass prefill_draft.sources=[damped]", ("calibration",)),
         ("method=one_pass prefill_draft.sources=[early] prefill_draft.fallback=[retrieval]", ("early", "datastore")),
         ("method=one_pass skip=similarity skip.s_min=0.99", ("early", "datastore")),
-        ("method=sp_vla", ()),
     ],
 )
 def test_a_method_needs_what_its_parts_read_and_nothing_else(overrides, wanted):

@@ -1,4 +1,4 @@
-"""What is executed unverified: always, by similarity, by agreement or by speed; and what lies inside the clock."""
+"""What is executed unverified: always, by similarity or by agreement; and what lies inside the clock."""
 
 import time
 from types import SimpleNamespace
@@ -18,13 +18,12 @@ from kerv_cli.engine.decisions import Choice
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.parts import Boundary
 from kerv_cli.engine.proposer import ChainProposer
-from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.heisd import SimilaritySkipSettings, VerifySkip
-from kerv_cli.methods.kerv.prediction import Hold, PredictionProposer, Ridge
+from kerv_cli.methods.kerv.prediction import Hold, PredictionProposer
 from kerv_cli.methods.merged import MergedProposer
-from kerv_cli.methods.unverified import AlwaysSkip, SpeedSkip, SpeedSkipSettings, StreakSkip, StreakSkipSettings
+from kerv_cli.methods.unverified import AlwaysSkip, StreakSkip, StreakSkipSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 PAUSE = 0.03
@@ -215,95 +214,6 @@ def test_the_boundarys_path_begins_where_the_episode_does():
         [(2 * HOME).tolist()],
         [(2 * HOME).tolist(), (2 * HOME + 0.01).tolist()],
     ]
-
-
-# --- sp vla
-
-SPACE = SPEC.actions
-
-
-def least_squares(history: np.ndarray, penalty: float, steps: int) -> np.ndarray:
-    """The ridge regression as ordinary least squares with two rows more, one per coefficient."""
-    rows = np.stack([np.arange(len(history)), np.ones(len(history))], 1)
-    left = np.concatenate([rows, np.sqrt(penalty) * np.eye(2)])
-    right = np.concatenate([history, np.zeros((2, history.shape[1]))])
-    slope, start = np.linalg.lstsq(left, right, rcond=None)[0]
-    return np.stack([start + slope * (len(history) + ahead) for ahead in range(steps)])
-
-
-@pytest.mark.parametrize("penalty", [0.0, 1e-4, 0.7, 50.0])
-@pytest.mark.parametrize("window", [2, 6, 10])
-def test_the_regression_is_that_of_least_squares(penalty, window):
-    history = np.random.default_rng(window).uniform(-0.1, 0.1, (10, 4))  # small: nothing is clipped
-    predicted = Ridge(SPACE.is_strict, penalty, window, 5).predict(history, 5)
-    expected = least_squares(history[-window:], penalty, 5)
-    expected[:, SPACE.is_strict] = history[-1, SPACE.is_strict]
-    assert predicted == pytest.approx(expected, abs=1e-9)
-
-
-class Counting(MockTarget):
-    """Counts the observations that it encodes."""
-
-    encoded = 0
-
-    def encode(self, observation: Observation) -> torch.Tensor:
-        self.encoded += 1
-        return super().encode(observation)
-
-
-def played(speed: float, decodes: int, target: MockTarget, seeds: int = 1, **settings: Any) -> list[DecodeRecord]:
-    """The decodes of episodes whose hand moves at `speed`, m/s, in every control step."""
-    target_settings = SpeedSkipSettings(**settings)
-    skip = SpeedSkip(target_settings, Context(target, None))  # type: ignore[arg-type]
-    decoder = Decoder(target, Parts(skip=skip))
-    records = []
-    for seed in range(seeds):
-        hand = HOME.copy()
-        decoder.reset("t", seed, hand)
-        for _ in range(decodes):
-            records.append(decoder.decode(SHOWN))
-            for action in records[-1].actions:
-                hand = hand + np.array([0.6, 0.0, 0.8]) * speed / SPACE.control_hz
-                decoder.observe(action, hand)
-    return records
-
-
-def schedule(records: list[DecodeRecord]) -> str:
-    """t: the target decoded, r: the regression."""
-    return "".join("r" if record.skipped else "t" for record in records)
-
-
-@pytest.mark.parametrize(
-    ("speed", "settings", "expected"),
-    [
-        (0.5, {}, "ttrtrtr"),  # six actions, then more than half of the last six must be the target's
-        (0.29, {}, "ttttttt"),
-        (0.5, {"v_max": 0.4}, "ttttttt"),
-        (0.5, {"v_min": 0.51}, "ttttttt"),
-        (0.5, {"share": 0.2}, "ttrrtrr"),
-        (0.5, {"share": 1.0}, "ttttttt"),
-        (0.5, {"buffer": 9}, "tttrrtt"),  # five of nine, then one of nine
-        (0.5, {"buffer": 4}, "trtrtrt"),
-    ],
-)
-def test_speed_and_the_targets_share_decide(speed, settings, expected):
-    assert schedule(played(speed, 7, MockTarget(SPACE, 4), **settings)) == expected
-
-
-def test_an_episode_begins_with_the_target_whatever_was_before():
-    assert schedule(played(0.5, 3, MockTarget(SPACE, 4), seeds=2)) == "ttrttr"
-
-
-def test_an_intuitive_decode_runs_nothing_of_the_target():
-    target = Counting(SPACE, 4)
-    *before, intuitive = played(0.5, 3, target)
-    assert (intuitive.forwards, target.encoded) == (0, 2)
-    assert [(r.mode, r.proposer) for r in intuitive.rounds] == [("skip", "ridge")]
-    history = SPACE.normalise(np.concatenate([record.actions for record in before]))[-6:]
-    line = np.clip(least_squares(history, 1e-4, 4), -1, 1)
-    line[:, SPACE.is_strict] = history[-1, SPACE.is_strict]
-    assert intuitive.tokens == tuple(SPACE.bins_of(line).flatten())
-    assert intuitive.unverified == intuitive.actions.size == 16
 
 
 # --- streak

@@ -80,7 +80,7 @@ def run(config: Mapping[str, Any], url: str, folder: Path, name: str) -> list[di
 
 
 @pytest.mark.bits
-@pytest.mark.parametrize(("target", "words"), [("nano-state", ["method=sp_vla"]), ("nano-vision", ["method=spec_vla"])])
+@pytest.mark.parametrize(("target", "words"), [("nano-state", ["method=ar"]), ("nano-vision", ["method=spec_vla"])])
 def test_a_benchmark_run_by_vla_eval_has_the_episodes_of_a_rollout(results, tmp_path, target, words):
     name = f"{target}-{words[0][7:]}"
     evaluated(policy_of(results, target, *words), METAWORLD, tmp_path, name)

@@ -29,7 +29,8 @@ class Drafts:
     Attributes:
         depth: Largest number of tokens in a drafted chain, or of levels in a tree. 0 if the method uses no drafter.
         nodes: Largest number of nodes of a drafted tree. 0 if the drafter drafts chains.
-        source: What drafts once per decode, instead of the drafter or in addition to it: `early` or `retrieval`. Empty if only the drafter drafts.
+        source: What drafts once per decode, instead of the drafter or in addition to it: `early` or `retrieval`. Empty
+            if only the drafter drafts.
         in_prefill: Whether the prefill verifies the draft of `source`.
         retrieved: Share of the verified decodes in which `source` drafts instead of the drafter.
         skipped: Share of the decodes that execute the draft of `source` unverified.

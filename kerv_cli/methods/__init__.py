@@ -5,7 +5,7 @@
     eagle                       EAGLE-2: our own and published drafters, which read the target's hidden states
     early                       ours: the early drafter drafts a chunk before the prefill
     kerv                        KERV: predictions from the motion, and thresholds that follow the motion
-    unverified                  tokens without verification: OpenVLA-OFT's parallel pass, drafts, SP-VLA's regression
+    unverified                  tokens without verification: OpenVLA-OFT's parallel pass, drafts, streaks
     heisd                       HeiSD: retrieved drafts, a boundary between two drafters, skipped verification
     reuse                       Jacobi decoding as in PD-VLA, and prompt lookup in the last chunk's tokens
     merged                      ours: several drafts in one tree, before the prefill (`method=one_pass`)

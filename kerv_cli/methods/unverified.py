@@ -1,19 +1,15 @@
-"""Skip rules that execute tokens without verification: the parallel pass, drafts, streaks, SP-VLA's regression.
+"""Skip rules that execute tokens without verification: the parallel pass, drafts, streaks.
 
 parallel    all tokens of a chunk in one forward of the target, as in OpenVLA-OFT (docs/methods.md §6)
 streak      drafts, as long as verified drafts agree with the target (§4.5, ours)
 always      every draft (§6)
-speed       SP-VLA: a regression predicts the chunk while the hand is fast, else the target decodes it (§6.1)
 """
 
 from __future__ import annotations
 
-import math
-from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import number
 from kerv_cli.base.registry import NoSettings, SkipPart
 from kerv_cli.engine.decisions import SkipDecision
@@ -150,65 +146,3 @@ class AlwaysSkip(Skip):
         if not chains or len(chains[0]) < chunk.size:
             return SkipDecision()
         return SkipDecision(chains[0], self.source.name)
-
-
-@dataclass
-class SpeedSkipSettings:
-    """SP-VLA: while the hand is fast, execute a chunk that a ridge regression predicts from the last actions."""
-
-    kind: str = "speed"
-    v_min: float = number(0.3, 0, 1000)  # lowest hand speed at which the regression is used, metres per second
-    v_max: float = number(1000.0, 0, 1000)  # highest hand speed at which the regression is used
-    buffer: int = number(6, 2, 10)  # number of last actions that the regression reads (paper: n)
-    share: float = number(0.5, 0, 1)  # the target must have decoded more than this share of them (paper: τ)
-    penalty: float = number(1e-4, 0, 1e6)  # ridge penalty λ
-
-    def check_together(self, prefix: str) -> None:
-        """Refuse a `v_min` above `v_max`.
-
-        Raises:
-            UsageError: `v_min` is above `v_max`.
-        """
-        if self.v_min > self.v_max:
-            raise UsageError(f"skip.v_min={self.v_min:g} skip.v_max={self.v_max:g}: v_min must not be above v_max")
-
-
-@SkipPart("speed", SpeedSkipSettings, colour=0x8C6D31)
-class SpeedSkip(Skip):
-    """SP-VLA: executes a predicted chunk if the hand is fast and the target decoded enough of the last actions.
-
-    Otherwise the target decodes the chunk. The prediction is a ridge regression on the last `buffer` executed actions.
-
-    Attributes:
-        decoded: For each of the last `buffer` actions, whether the target decoded it.
-        executed: Number of actions executed in this episode.
-        by_target: Whether the target decoded the last chunk. If not, the chunk was predicted.
-    """
-
-    def __init__(self, settings: SpeedSkipSettings, context: Context) -> None:
-        """Compute the weights of the regression."""
-        from kerv_cli.methods.kerv.prediction import Ridge
-
-        self.settings, target = settings, context.target
-        self.ridge = Ridge(target.actions.is_strict, settings.penalty, settings.buffer, target.chunk)
-        self.decoded: deque[bool] = deque(maxlen=settings.buffer)
-        self.executed, self.by_target = 0, True
-
-    def begin(self, task: str, seed: int) -> None:
-        """Begin an episode: forget the last actions."""
-        self.decoded.clear()
-        self.executed, self.by_target = 0, True
-
-    def take(self, chunk: Chunk) -> SkipDecision:
-        """Return the predicted chunk if the hand is fast and the target decoded enough actions, else no chunk."""
-        path, s = chunk.situation.path, self.settings
-        self.decoded.extend([self.by_target] * (len(path) - 1 - self.executed))
-        self.executed = len(path) - 1
-        predicted = self.ridge.predict(chunk.situation.history.values(), chunk.steps)
-        self.by_target = True
-        if predicted is not None and sum(self.decoded) > s.share * s.buffer:
-            speed = chunk.space.control_hz * math.dist(path[-1], path[-2])
-            if s.v_min <= speed <= s.v_max:
-                self.by_target = False
-                return SkipDecision(chunk.space.bins_of(predicted).flatten().tolist(), self.ridge.name)
-        return SkipDecision()

@@ -57,7 +57,6 @@ METHODS = {
     "one_pass": "a network drafts the action; one run verifies prompt and draft",
     "parallel": "a policy that writes all tokens in one run",
     "retrieval_unverified": "the most similar demonstration runs, nobody verifies it",
-    "sp_vla": "extrapolates fast motion, the policy decodes slow motion",
     "spec_vla": "a small network drafts a tree of tokens, the policy verifies",
 }
 """Family of methods -> what its methods do."""

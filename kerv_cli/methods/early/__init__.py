@@ -1,4 +1,4 @@
-"""The early drafter: drafts a whole chunk from the prompt, before the target's trunk runs (docs/methods.md §5, ours)."""
+"""The early drafter: drafts a whole chunk from the prompt, before the prefill (docs/methods.md §5, ours)."""
 
 from __future__ import annotations
 

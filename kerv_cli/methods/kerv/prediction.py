@@ -245,32 +245,6 @@ class Walk(Predictor):
         return np.tile(state, (self.horizon, 1))
 
 
-class Ridge(Predictor):
-    """SP-VLA: fits a line to the past actions of each DoF by ridge regression on time, and continues the line.
-
-    Attributes:
-        penalty: Ridge penalty λ of slope and intercept.
-        window: Number of past actions that the line is fitted to. With fewer past actions, nothing is predicted.
-    """
-
-    name = "ridge"
-
-    def __init__(self, held: np.ndarray, penalty: float, window: int, horizon: int) -> None:
-        self.penalty = penalty
-        super().__init__(held, None, window, window, horizon)
-
-    def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return the weights (horizon, window) of the past actions: X' (XᵀX + λI)⁻¹ Xᵀ, where λ is the penalty.
-
-        X has one row (t, 1) for each past control step t = 0, 1, …. X' has one such row for each future control step.
-        """
-        times = np.arange(window + self.horizon)
-        rows = np.stack([times, np.ones(len(times))], 1)
-        past, ahead = rows[:window], rows[window:]
-        fitted: np.ndarray = np.linalg.solve(past.T @ past + self.penalty * np.eye(2), past.T)
-        return ahead @ fitted
-
-
 FILTERS = ("kalman", "damped")
 PREDICTORS = {kind.name: kind for kind in (Hold, Linear, Kalman, Damped, Walk)}
 

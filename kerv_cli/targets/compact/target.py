@@ -95,7 +95,6 @@ class CompactTarget(Compilable):
         feed_forward: Number of hidden units per layer. The layers of a drafter have as many.
         enlarges: Function that enlarges a drafter in place, as this target was enlarged (docs/methods.md §0.2). None if
             drafters stay as they are.
-        hand_and_object: Positions (3,) in metres of the hand and the object in the last observation that `encode` read.
             A vision policy estimates the object's position. None until `encode` has read an observation.
     """
 
@@ -114,7 +113,6 @@ class CompactTarget(Compilable):
         s = self.settings = settings
         self.actions, self.observation, self.words, self.sha256 = actions, observation, words, ""
         self.enlarges: Callable[[Any], None] | None = None
-        self.hand_and_object: tuple[Tensor, Tensor] | None = None
         self.chunk, self.parallel = s.chunk, s.parallel
         self.width, self.heads, self.feed_forward = s.width, s.heads, s.feed_forward
         self.cameras = (camera,) if s.observation == "vision" else ()
@@ -216,10 +214,7 @@ class CompactTarget(Compilable):
             CheckpointError: The observation does not fit the target, see `inputs`.
             UsageError: The instruction has too many words.
         """
-        inputs = self.inputs(observation)
-        prompt, places = self.encode_batch(inputs)
-        self.hand_and_object = inputs.proprioception[0, :3], places[0, 0]
-        return prompt
+        return self.encode_batch(self.inputs(observation))[0]
 
     def encode_many(self, observations: Sequence[Observation]) -> Tensor:
         """Encode B observations as prompts (B, P, E).
