@@ -187,7 +187,7 @@ def test_typer_completes_keys_and_names():
     assert completed("rollout", "me", shell="bash").split() == ["method="]
     assert '"method=spec_vla"' in completed("rollout", "method=spec")
     # bash splits words at '='
-    assert completed("rollout", "method", "=", "spec", shell="bash").split() == ["spec_vla", "spec_vla_tuned"]
+    assert completed("rollout", "method", "=", "spec", shell="bash").split() == ["spec_vla"]
     assert "drawer-open-v3" in completed("rollout", "task", "=", shell="bash").split()
 
 

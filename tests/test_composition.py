@@ -167,7 +167,7 @@ def test_a_threshold_that_nothing_reads_may_be_batched():
     [
         ("method=ar", ()),
         ("method=spec_vla", ("drafter",)),
-        ("method=spec_vla threshold=kinematic", ("drafter", "calibration")),
+        ("method=spec_vla threshold=offset", ("drafter", "calibration")),
         ("method=spec_vla threshold=change threshold.k_s=0.3", ("drafter",)),
         ("method=kerv", ("drafter", "calibration")),
         ("method=heisd", ("drafter", "datastore", "calibration")),
@@ -175,7 +175,7 @@ def test_a_threshold_that_nothing_reads_may_be_batched():
         ("proposer=retrieval", ("datastore",)),
         ("proposer=kalman", ("calibration",)),
         ("method=one_pass", ("early",)),
-        ("method=one_pass prefill_draft.sources=[damped]", ("calibration",)),
+        ("method=one_pass prefill_draft.sources=[kalman]", ("calibration",)),
         ("method=one_pass prefill_draft.sources=[early] prefill_draft.fallback=[retrieval]", ("early", "datastore")),
         ("method=one_pass skip=similarity skip.s_min=0.99", ("early", "datastore")),
     ],
@@ -218,7 +218,7 @@ def test_an_override_without_effect_is_found(words, idle):
 
 def test_no_rectifier_counts_in_the_shipped_methods_that_verify_nothing():
     names = [path.stem for path in conf_dir().glob("method/*_unverified.yaml")]
-    assert len(names) == 3
+    assert len(names) == 2
     for name in names:
         settings = compose("rollout", [f"method={name}"], RolloutSettings)
         assert "rectifier" in idle_keys(settings)

@@ -40,7 +40,7 @@ def chosen(**names: str) -> Method:
     [
         {"acceptance": "relaxed"},
         {"acceptance": "sequence"},
-        {"threshold": "kinematic"},
+        {"threshold": "offset"},
         {"rectifier": "compensate"},
         {"proposer": "kalman"},
         {"prefill_draft": "hold"},

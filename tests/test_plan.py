@@ -25,7 +25,7 @@ from kerv_cli.report.summary import not_in_turn
 from kerv_cli.report.tables import load_study
 
 TASKS = ("reach-v3", "push-v3")
-KNOWN = {"one_pass": "9c60b00642c8dfff", "kerv_tuned": "dae9f3020f7fd9a3", "heisd_tuned": "0d5d8289113af100"}
+KNOWN = {"one_pass": "9c60b00642c8dfff"}
 """Identities of these presets in version 1.0.0, on a target whose hash is 64 times a."""
 Found = dict[tuple[str, str], tuple[list[int], str]]
 

@@ -20,7 +20,6 @@ from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.kerv import CompensateSettings, Compensation
 from kerv_cli.methods.kerv.prediction import (
-    FILTERS,
     HORIZON,
     PREDICTORS,
     Hold,
@@ -131,7 +130,7 @@ def test_the_public_codes_filter_is_a_random_walk():
 
 def test_a_gripper_is_filtered_only_with_a_fitted_noise():
     actions = np.random.default_rng(1).uniform(-1, 1, (10, D))
-    unfitted, fitted = (Noise((1.0, 1.0, 1.0, q), (1.0,) * D, (1.0,) * D) for q in (0.0, 1.0))
+    unfitted, fitted = (Noise((1.0, 1.0, 1.0, q), (1.0,) * D) for q in (0.0, 1.0))
     assert Kalman(SPACE.is_strict, fitted).predict(actions, 1)[0, 3] == actions[-1, 3]
     free = Kalman(SPACE.is_strict, fitted).released().predict(actions, 1)[0]
     assert free[3] == pytest.approx(np.clip(kalman_weights(1.0, 1.0, 10, 1) @ actions[:, 3], -1, 1)[0])
@@ -252,12 +251,12 @@ DOFS = 4
 HELD = (False, False, False, True)
 
 
-def noise_of(q: float, r: float, damping: float) -> Noise:
+def noise_of(q: float, r: float) -> Noise:
     """The same for all DoFs."""
-    return Noise((q,) * DOFS, (r,) * DOFS, (damping,) * DOFS)
+    return Noise((q,) * DOFS, (r,) * DOFS)
 
 
-NOISE = {name: noise_of(5.0, 0.5, 0.8 if name == "damped" else 1.0) for name in FILTERS}
+NOISE = {"kalman": noise_of(5.0, 0.5)}
 
 
 @functools.cache
@@ -265,10 +264,10 @@ def predictor(kind: str, held: tuple[bool, ...] = HELD, **shape: int) -> Predict
     return PREDICTORS[kind](np.array(held), NOISE.get(kind), **shape)
 
 
-def most_probable_path(window: np.ndarray, q: float, r: float, steps: int, damping: float = 1.0) -> np.ndarray:
+def most_probable_path(window: np.ndarray, q: float, r: float, steps: int) -> np.ndarray:
     """(steps,): the reference, without a recursion. The first state and every random push are unknowns; the most
     probable ones are a weighted least-squares solution, and what is ahead goes on from them without a push."""
-    transition, push = np.array([[1, damping], [0, damping]]), np.array([0.5, 1.0])
+    transition, push = np.array([[1, 1], [0, 1]]), np.array([0.5, 1.0])
     pushes = len(window) - 1
     state = np.hstack([np.eye(2), np.zeros((2, pushes))])  # of time 0, in the unknowns
     first, rows = state.copy(), []
@@ -296,14 +295,12 @@ log_scale = st.floats(-4, 3).map(lambda x: 10.0**x)
     log_scale,
     log_scale,
     st.integers(1, HORIZON),
-    st.sampled_from([1.0, 0.7]),
 )
-def test_a_filter_goes_on_along_the_newest_actions_most_probable_path_clipped(history, q, r, steps, damping):
-    for kind in FILTERS:
-        ahead = PREDICTORS[kind](np.array(HELD), noise_of(q, r, damping), minimum=2).predict(history, steps)
-        for dof in range(DOFS - 1):
-            expected = most_probable_path(history[-WINDOW:, dof], q, r, steps, damping)
-            np.testing.assert_allclose(ahead[:, dof], np.clip(expected, -1, 1), rtol=1e-6, atol=1e-6)
+def test_a_filter_goes_on_along_the_newest_actions_most_probable_path_clipped(history, q, r, steps):
+    ahead = PREDICTORS["kalman"](np.array(HELD), noise_of(q, r), minimum=2).predict(history, steps)
+    for dof in range(DOFS - 1):
+        expected = most_probable_path(history[-WINDOW:, dof], q, r, steps)
+        np.testing.assert_allclose(ahead[:, dof], np.clip(expected, -1, 1), rtol=1e-6, atol=1e-6)
 
 
 def test_hold_and_linear():

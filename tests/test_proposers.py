@@ -87,7 +87,7 @@ def proposers(target: CompactTarget, prompt: torch.Tensor, truth: list[int], see
     return {
         "hold": hold,
         "linear": PredictionProposer(Linear(HELD, minimum=2, horizon=horizon)),
-        "kalman": PredictionProposer(Kalman(HELD, Noise(*3 * [(1.0,) * D]), horizon=horizon)),
+        "kalman": PredictionProposer(Kalman(HELD, Noise(*2 * [(1.0,) * D]), horizon=horizon)),
         "early": early,
         "retrieval": retrieval,
         "merged": MergedProposer([early, retrieval], int(random.integers(1, 80)), [hold]),

@@ -174,7 +174,7 @@ def test_random_keeps_its_share_and_repeats_itself():
 # --- thresholds
 
 levels = st.floats(0, 50)
-CLOSED_LOOP = ("kinematic", "change", "offset", "quoted")
+CLOSED_LOOP = ("change", "offset", "quoted")
 TASKS = {"reach-v3": 0.7}
 
 
@@ -205,24 +205,6 @@ def radius_after(chosen: Threshold, *variability: float | None) -> int:
 
 def rounded(r: float) -> int:
     return math.floor(r + 0.5)
-
-
-@given(levels, st.floats(0.01, 5), st.floats(0.5, 4))
-def test_kinematic_is_the_level_form(k, k_s, phi):
-    r = radius_after(threshold("kinematic", k_s=k_s, phi=phi), k)
-    exact = 5 + 10 * math.exp(-((k / k_s) ** phi))
-    assert abs(r - exact) <= 0.5 + 1e-9
-
-
-def test_kinematic_at_its_landmarks():
-    chosen = threshold("kinematic")
-    assert chosen.radius() == rounded(5 + 10 / math.e) == 9  # an episode begins at the reference level
-    assert radius_after(chosen, 0.0) == 15
-    assert radius_after(chosen, 0.4) == 9
-    assert radius_after(chosen, 1e300) == 5
-    assert radius_after(chosen, None) == 5  # nothing was compared: r stays
-    chosen.reset()
-    assert chosen.radius() == 9
 
 
 def bump(change: float) -> float:
@@ -304,11 +286,11 @@ def test_the_reference_level_is_the_tasks_where_none_is_given(kind):
     ("kind", "values", "says"),
     [
         ("fixed", {"r": -1}, "threshold.r=-1"),
-        ("kinematic", {"k_s": 0.0}, "threshold.k_s=0.0"),
-        ("kinematic", {"k_s": math.nan}, "threshold.k_s=nan"),
-        ("kinematic", {"r_min": 16}, "threshold.r_min=16 threshold.r_max=15"),
+        ("offset", {"k_s": 0.0}, "threshold.k_s=0.0"),
+        ("offset", {"k_s": math.nan}, "threshold.k_s=nan"),
+        ("offset", {"r_min": 16}, "threshold.r_min=16 threshold.r_max=15"),
         ("change", {"r_min": -1}, "threshold.r_min=-1"),
-        ("kinematic", {"phi": 0.0}, "threshold.phi=0"),
+        ("offset", {"phi": 0.0}, "threshold.phi=0"),
         ("schedule", {"tau": 0.0}, "threshold.tau=0"),
     ],
 )

@@ -40,7 +40,7 @@ def parts_of(family: str, target: Any, prompt: torch.Tensor, truth: list[int]) -
     chain, tree = (DrafterProposer(drafter, target, *sizes) for sizes in ((5, 1, 5), (3, 4, 9)))
     early = EarlyProposer(network.requires_grad_(False), target)
     hold = PredictionProposer(Hold(HELD, minimum=1, horizon=CHUNK))
-    kalman = PredictionProposer(Kalman(HELD, Noise(*3 * [(1.0,) * D]), horizon=CHUNK))
+    kalman = PredictionProposer(Kalman(HELD, Noise(*2 * [(1.0,) * D]), horizon=CHUNK))
     both = HybridProposer(chain, retrieval)
     merged = MergedProposer([early], 48, [hold, kalman])
     return {

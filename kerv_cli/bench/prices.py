@@ -47,7 +47,7 @@ class Family:
 
 _TREE = Drafts(5, 49)
 FAMILIES = (
-    Family("drafter, chain", "spec_vla_tuned", Drafts(15)),
+    Family("drafter, chain", "spec_vla", Drafts(15)),
     Family("drafter, tree", "spec_vla", _TREE, length=(3.63 + 3.91) / 2, reported="1.22–1.42"),
     Family("tree, then prediction", "kerv", _TREE, reported="1.27–1.37 × naive SD"),
     Family(

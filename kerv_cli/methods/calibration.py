@@ -128,7 +128,7 @@ class Calibration:
         target: The target that was measured.
         demos: The demonstrations.
         window: Number of past actions that a predictor reads, one per control step.
-        noise: Noise of each Kalman filter per DoF, by the filter's name (`kalman`, `damped`).
+        noise: Noise of the Kalman filter per DoF, by the filter's name, `kalman`.
         variability: Typical kinematic variability K of each task, with its reference level K_S.
         boundary: Ranges of the hand's path, by which HeiSD's boundary scales radius of curvature and path length.
         skip: Thresholds at which verification is skipped.

@@ -11,7 +11,6 @@ The numbers are measured on demonstrations. The JSON file holds:
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, replace
@@ -33,7 +32,7 @@ from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.heisd.curvature import BoundaryRanges
 from kerv_cli.methods.heisd.datastore import Datastore
-from kerv_cli.methods.kerv.prediction import FILTERS, Noise, kalman_weights
+from kerv_cli.methods.kerv.prediction import Noise, kalman_weights
 from kerv_cli.targets.observations import check_tail, observations_of
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_tasks, demos_for
@@ -62,8 +61,6 @@ s_min is the smallest similarity at which verification is skipped.
 
 RATIOS = np.logspace(-3, 3, 49)
 """Grid of the Kalman filter's ratio q / r (process noise to measurement noise), with r = 1."""
-DAMPINGS = (0.95, 0.9, 0.85, 0.8, 0.75, 0.7, 0.6, 0.5, 0.3)
-"""Grid of the damped filter's damping: the factor of the velocity at each control step."""
 
 
 def calibrate(
@@ -269,11 +266,9 @@ def completed(old: stored.Calibration, new: stored.Calibration) -> stored.Calibr
 
     The boundary ranges are those of `new`, because `fit_boundary` has already copied the old ranges into `new`.
     """
-    noise = {}
-    for kind in FILTERS:
-        known, found = old.noise[kind], new.noise[kind]
-        columns = np.where(known.q, astuple(known), astuple(found))  # q, r and damping
-        noise[kind] = Noise(*map(tuple, columns.tolist()))
+    known, found = old.noise["kalman"], new.noise["kalman"]
+    columns = np.where(known.q, astuple(known), astuple(found))  # q and r
+    noise = {"kalman": Noise(*map(tuple, columns.tolist()))}
     variability = dict(new.variability)
     for task, row in old.variability.items():
         measured = new.variability[task].levels if task in new.variability else {}
@@ -370,48 +365,30 @@ def choose_episodes(dataset: DemoDataset, tasks: Sequence[str], limit: int) -> l
     return chosen
 
 
-def fit_noise(past: np.ndarray, future: np.ndarray, dampings: Sequence[float]) -> tuple[float, float]:
-    """Find the noise and damping of one DoF's Kalman filter.
-
-    Try every pair of a noise in `RATIOS` and a damping. Return the pair whose predictions have the smallest mean
-    absolute error.
+def fit_noise(past: np.ndarray, future: np.ndarray) -> float:
+    """Return the process noise q in `RATIOS` with which one DoF's Kalman filter predicts best, for a noise r = 1.
 
     Args:
         past: (n, window) normalised actions before each of n moments.
-        future: (n, H) normalised actions from each moment on.
-        dampings: Dampings to try: factors of the velocity at each control step. With 1 the velocity stays constant.
-
-    Returns:
-        The process noise q, for a measurement noise r = 1, and the damping.
+        future: (n, H) normalised actions from each moment on. Their mean absolute error counts.
     """
-    window, steps = past.shape[1], future.shape[1]
 
-    def error(candidate: tuple[float, float]) -> float:
-        damping, q = candidate
-        weights = kalman_weights(q, 1.0, window, steps, damping)
+    def error(q: float) -> float:
+        weights = kalman_weights(q, 1.0, past.shape[1], future.shape[1])
         return float(np.abs(np.clip(past @ weights.T, -1.0, 1.0) - future).mean())
 
-    damping, q = min(itertools.product(dampings, map(float, RATIOS)), key=error)
-    return q, damping
+    return min(map(float, RATIOS), key=error)
 
 
 def fit_filters(past: np.ndarray, future: np.ndarray) -> dict[str, Noise]:
-    """Fit the Kalman filters `kalman` and `damped`.
+    """Fit the Kalman filter of every DoF, strict DoFs included.
 
     Args:
         past: (n, window, D) normalised actions before each of n moments.
-        future: (n, H, D) normalised actions from each moment on, which the filters should predict.
-
-    Returns:
-        For each filter's name, the noise and damping per DoF, strict DoFs included.
+        future: (n, H, D) normalised actions from each moment on, which the filter should predict.
     """
-    noise = {}
-    for kind in FILTERS:
-        dampings = DAMPINGS if kind == "damped" else (1.0,)
-        fits = [fit_noise(past[..., dof], future[..., dof], dampings) for dof in range(past.shape[2])]
-        ratios, found = zip(*fits, strict=True)
-        noise[kind] = Noise(ratios, (1.0,) * len(fits), found)
-    return noise
+    ratios = tuple(fit_noise(past[..., dof], future[..., dof]) for dof in range(past.shape[2]))
+    return {"kalman": Noise(ratios, (1.0,) * len(ratios))}
 
 
 @dataclass(frozen=True)

@@ -55,10 +55,10 @@ def predictor(settings: NoSettings, context: Context) -> Predictor:
 
     The noise of a Kalman filter comes from the calibration.
     """
-    from kerv_cli.methods.kerv.prediction import FILTERS, PREDICTORS
+    from kerv_cli.methods.kerv.prediction import PREDICTORS, Kalman
 
     kind, held, horizon = PREDICTORS[settings.kind], context.target.actions.is_strict, context.target.chunk
-    if kind.name not in FILTERS:
+    if not issubclass(kind, Kalman):
         return kind(held, minimum=kind.least, horizon=horizon)
     fitted = context.calibration
     return kind(held, fitted.noise[kind.name], window=fitted.window, horizon=horizon)
@@ -68,7 +68,6 @@ _noise = ("calibration",)  # Kalman filters need the noise that `kerv calibrate`
 PredictorPart("hold", colour=0xE69F00)(predictor)
 PredictorPart("linear", colour=0x0072B2)(predictor)
 PredictorPart("kalman", needs=_noise, colour=0xD55E00)(predictor)
-PredictorPart("damped", needs=_noise, colour=0xA0522D)(predictor)
 PredictorPart("walk", colour=0x999933)(predictor)
 
 ACCEPTED = "accepted"
@@ -96,7 +95,7 @@ class CompensateSettings:
     """KERV: after a rejected draft token, predict the rest of the token's control step (see `Compensation`)."""
 
     kind: str = "compensate"
-    # kalman, damped, hold, linear (ours); walk (public code); draft: the rejected draft's remaining tokens (ours)
+    # kalman, hold, linear (ours); walk (public code); draft: the rejected draft's remaining tokens (ours)
     predictor: str = "hold"
     hold_strict: bool = True  # true: strict DoFs keep their last value (ours); false: predicted like others (summary)
     steps: int = number(1, 1, MOST_TOKENS)  # control steps that a prediction may fill (paper: predict length PL)
@@ -209,10 +208,9 @@ class KinematicThresholdSettings(RadiusRange):
     - `offset`: r = r_min + Δr, as KERV's README says. r shrinks when K changes.
     - `quoted`: r ← r + Δr, as the formula is printed. r never shrinks.
     - `change`: r shrinks when K has risen.
-    - `kinematic` (ours): r is large while K is small.
     """
 
-    kind: str = "kinematic"
+    kind: str = "offset"
     r_min: int = number(5, 0, MOST_BINS)  # smallest radius, bins
     r_max: int = number(15, 0, MOST_BINS)  # largest radius, bins
     phi: float = number(2.0, above=0, most=50)  # exponent φ of K / K_S
@@ -257,7 +255,6 @@ class Variable(Threshold):
     After each decode that compared drafts, r becomes, with f(x) = r_min + (r_max − r_min) · exp(−(x / K_S)^φ) and the
     change ΔK since the last such decode:
 
-    - `kinematic` (ours): f(K).
     - `change`: r ± (r_max − f(|ΔK|)). r shrinks if K has risen, and grows if K has fallen.
     - `offset` (KERV's README): f(|ΔK|). So r is large while K is steady.
     - `quoted` (arXiv 2603.01581): r + f(|ΔK|) − r_min. r never shrinks: it rises from r_min to r_max and stays.
@@ -314,11 +311,11 @@ class Variable(Threshold):
         elif s.kind == "quoted":
             r = self.r + self.falling(abs(change)) - s.r_min
         else:
-            r = self.falling(variability if s.kind == "kinematic" else abs(change))
+            r = self.falling(abs(change))
         self.r, self.last = min(s.r_max, max(s.r_min, r)), variability
 
 
-for _kind in ("kinematic", "change", "offset", "quoted"):
+for _kind in ("offset", "change", "quoted"):
     ThresholdPart(_kind, KinematicThresholdSettings, radius="r_max", needs=KinematicThresholdSettings.needs)(Variable)
 
 

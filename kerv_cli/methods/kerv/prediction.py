@@ -38,17 +38,14 @@ class Noise:
     Attributes:
         q: Process noise: variance of the random acceleration per control step.
         r: Measurement noise: variance of the observed actions.
-        damping: Factor by which the velocity changes per control step. 1 (constant velocity) for the predictor
-            `kalman`, less than 1 for `damped`.
     """
 
     q: tuple[float, ...]
     r: tuple[float, ...]
-    damping: tuple[float, ...]
 
 
 @functools.lru_cache(maxsize=64)
-def filter_state(ratio: float, window: int, damping: float) -> tuple[np.ndarray, np.ndarray]:
+def filter_state(ratio: float, window: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights by which a Kalman filter's state depends on the last actions.
 
     The state is [action, velocity]. The filter begins at the first action a₀ with the state [a₀, 0] and the covariance
@@ -57,7 +54,6 @@ def filter_state(ratio: float, window: int, damping: float) -> tuple[np.ndarray,
     Args:
         ratio: q / r, process noise divided by measurement noise.
         window: Number of actions.
-        damping: Factor of the velocity per control step.
 
     Returns:
         Two matrices. The weights (2, window) times the actions (oldest first) give the state after the last action. The
@@ -65,7 +61,7 @@ def filter_state(ratio: float, window: int, damping: float) -> tuple[np.ndarray,
     """
     from filterpy.kalman import KalmanFilter
 
-    transition = np.array([[1.0, damping], [0.0, damping]])
+    transition = np.array([[1.0, 1.0], [0.0, 1.0]])
     model = KalmanFilter(dim_x=2, dim_z=1)
     model.F, model.H = transition, np.eye(1, 2)
     model.P, model.Q, model.R = np.eye(2), ratio * np.outer([0.5, 1.0], [0.5, 1.0]), np.eye(1)  # all divided by r
@@ -80,7 +76,7 @@ def filter_state(ratio: float, window: int, damping: float) -> tuple[np.ndarray,
     return state, transition
 
 
-def kalman_weights(q: float, r: float, window: int, horizon: int, damping: float = 1.0) -> np.ndarray:
+def kalman_weights(q: float, r: float, window: int, horizon: int) -> np.ndarray:
     """Return the weights (horizon, window) of the past actions in a Kalman filter's predictions for one DoF.
 
     The prediction h control steps ahead is the dot product of row h − 1 and the last `window` actions (oldest first).
@@ -90,9 +86,8 @@ def kalman_weights(q: float, r: float, window: int, horizon: int, damping: float
         r: Measurement noise.
         window: Number of past actions.
         horizon: Number of control steps ahead.
-        damping: Factor of the velocity per control step.
     """
-    state, transition = filter_state(q / r, window, damping)
+    state, transition = filter_state(q / r, window)
     return np.stack([(np.linalg.matrix_power(transition, h) @ state)[0] for h in range(1, horizon + 1)])
 
 
@@ -211,14 +206,7 @@ class Kalman(Predictor):
     def weights(self, dof: int, window: int) -> np.ndarray:
         """Return the weights (horizon, window) of the last `window` actions in the filter's predictions for one DoF."""
         assert self.noise is not None
-        q, r, damping = self.noise.q[dof], self.noise.r[dof], self.noise.damping[dof]
-        return kalman_weights(q, r, window, self.horizon, damping)
-
-
-class Damped(Kalman):
-    """A Kalman filter whose velocity fades (not in the paper). Actions are bounded, so no velocity can last."""
-
-    name = "damped"
+        return kalman_weights(self.noise.q[dof], self.noise.r[dof], window, self.horizon)
 
 
 class Walk(Predictor):
@@ -245,8 +233,7 @@ class Walk(Predictor):
         return np.tile(state, (self.horizon, 1))
 
 
-FILTERS = ("kalman", "damped")
-PREDICTORS = {kind.name: kind for kind in (Hold, Linear, Kalman, Damped, Walk)}
+PREDICTORS = {kind.name: kind for kind in (Hold, Linear, Kalman, Walk)}
 
 
 class PredictionProposer(ChainProposer):
