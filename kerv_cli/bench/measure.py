@@ -439,3 +439,34 @@ def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Ma
     machine = machine.best_of(measure_machine(device, model.dtype))
     drafts = {(kind, 1): needs_of_draft(source) for kind, source in sources.items()}
     return machine, list(phases_of(seconds, model.sizes, machine, drafts))
+
+
+def card_rows(card: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield rows (name, value): sizes of the model, rates of the device, and shortest times of forwards.
+
+    Args:
+        card: Result of `measure.card_of`.
+    """
+    yield "weights that a forward reads", f"{card['weights'] / 1e6:.1f} M, {card['weight_bytes'] / 1e6:.1f} MB"
+    yield "cache of prompt and chunk", f"{card['cache_bytes'] / 1e6:.2f} MB"
+    yield "memory, measured", f"{card['bandwidth'] / 1e9:.1f} GB/s"
+    yield "memory that holds the weights, measured", f"{card['bandwidth_of_weights'] / 1e9:.1f} GB/s"
+    yield "arithmetic, measured", f"{card['flops'] / 1e9:.0f} GFLOP/s"
+    for name, (reading, computing) in card["floors"].items():
+        why = "to read the weights" if reading >= computing else "for the arithmetic"
+        yield f"floor of {name}", f"{1e3 * max(reading, computing):.2f} ms, {why}"
+
+
+def phase_rows(phases: Sequence[Phase]) -> Iterator[dict[str, str]]:
+    """Yield a row per measured phase. The floor is the shortest time that the device allows."""
+    for phase in phases:
+        row = {"phase": phase.name}
+        for name, seconds in (("median ms", phase.seconds), ("p95", phase.p95), ("least", phase.least)):
+            row[name] = f"{1e3 * seconds:.2f}"
+        limits = dict.fromkeys(("GB/s", "GFLOP/s", "floor ms", "least ÷ floor"), "–")
+        if phase.floor > 0:
+            limits["GB/s"] = f"{phase.read / phase.seconds / 1e9:.1f}"
+            limits["GFLOP/s"] = f"{phase.flops / phase.seconds / 1e9:.0f}"
+            limits["floor ms"] = f"{1e3 * phase.floor:.3f}"
+            limits["least ÷ floor"] = f"{phase.least / phase.floor:.1f}"
+        yield row | limits

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.limits import choice, number, setting
+from kerv_cli.base.limits import choice, limits, number, setting
 from kerv_cli.base.settings import CommandSettings, RunSettings
 from kerv_cli.bench.physics import CHUNK, DEVICES, SHAPES, SHARE
 
@@ -44,36 +44,27 @@ class BenchSettings(RunSettings):
 
 @dataclass
 class EstimateSettings(CommandSettings):
-    """Settings of `kerv estimate`, which computes how much speculation can speed up a policy. Nothing is run."""
+    """Settings of `kerv estimate`, which computes how much verified drafts can speed up a policy. Nothing is run."""
 
-    weights: str = setting("", "weights of the policy, encoder included: 7B, 450M; the rest of its shape is assumed")
-    model: str = setting("", "instead: a Hugging Face config.json or its folder, a target of kerv, or openvla-7b")
-    tokens: int | None = number(
-        None, 0, CHUNK, help="N, tokens per chunk; default: the model's, else 7. 0: it has none"
+    weights: str = setting("", f"size of the policy, such as 7B or 450M, or one of {', '.join(SHAPES)}")
+    code: str = choice(
+        "bins", "bins", "fast", "flow", help="what the policy emits: tokens per number, FAST, or no tokens"
     )
-    actions: int = number(1, 1, 1000, help="control steps per chunk")
-    hz: float | None = number(None, above=0, help="control steps per second that the robot asks for")
-    prompt: int | None = number(None, 1, 100_000, help="prompt tokens, the image's included")
-    vision: str = setting("", "vision encoder: its weights (400M), or its time (8ms)")
-    bits: int = number(16, 1, 32, help="bits of a weight of the language model; arithmetic stays in bfloat16")
+    tokens: int | None = number(None, 0, CHUNK, help="N, tokens per chunk; default: 7, FAST 30; 0: as code=flow")
     device: list[str] = setting(["h100"], f"GPUs: {', '.join(DEVICES)}")
-    on: list[str] = setting([], "instead: profiles of 'kerv bench', as on= of 'kerv report'")
-    trace: str = setting("", "price the decodes of this file, see docs/trace.md")
-    choose: str = choice("none", "none", "draft", help="draft: which length of drafted chains the trace's decodes want")
+    hz: float | None = number(None, above=0, help="control steps per second that the robot needs")
+    actions: int = number(1, 1, 1000, help="control steps per chunk")
+    accepted: list[float] = setting(
+        [0.5, 0.7, 0.9], "probabilities that a draft token is accepted after accepted ones", **limits(0, 1)
+    )
+    on: list[str] = setting([], "instead of weights and device: profiles of 'kerv bench', as on= of 'kerv report'")
 
     def check_together(self, prefix: str) -> None:
-        """Check settings that depend on each other.
-
-        Args:
-            prefix: Start of the settings' names in error messages.
-
-        Raises:
-            UsageError: A device is unknown, `choose` is set without `trace`, or `on` is set together with a policy.
-        """
-        if self.choose != "none" and not self.trace:
-            raise UsageError(f"{prefix}choose={self.choose} needs trace=FILE", f"{prefix}choose")
-        if self.on and (described := [key for key in ("weights", "model", "vision") if getattr(self, key)]):
-            raise UsageError(f"{prefix}on=PROFILE has the costs: leave out {', '.join(described)}", f"{prefix}on")
+        """Refuse an unknown device, no probability, and a size beside measured costs."""
+        if self.weights and self.on:
+            raise UsageError(f"{prefix}on=PROFILE has the costs: leave out weights", f"{prefix}on")
+        if not self.accepted:
+            raise UsageError(f"{prefix}accepted=[]: name at least one probability", f"{prefix}accepted")
         for name in self.device:
             if name not in DEVICES:
                 raise UsageError(f"{prefix}device={name}: known are {', '.join(DEVICES)}", f"{prefix}device")

@@ -33,9 +33,8 @@ def bench(settings: BenchSettings, as_json: AsJson = False) -> None:
     if settings.projected != "none":
         _project(settings, as_json)
         return
-    from kerv_cli.bench.measure import card_of, document, measure, measure_machine, title_of
+    from kerv_cli.bench.measure import card_of, card_rows, document, measure, measure_machine, phase_rows, title_of
     from kerv_cli.bench.model import open_model
-    from kerv_cli.bench.tables import card_rows, phase_rows
 
     model = open_model(settings)
     machine = measure_machine(model.target.device, model.dtype)
@@ -50,8 +49,7 @@ def bench(settings: BenchSettings, as_json: AsJson = False) -> None:
 
 def _project(settings: BenchSettings, as_json: bool) -> None:
     """Compute and write profiles for GPUs, and print them beside what others published."""
-    from kerv_cli.bench.prices import projections
-    from kerv_cli.bench.tables import anchor_rows, projection_rows
+    from kerv_cli.bench.projections import anchor_rows, projection_rows, projections
 
     computed = list(projections(settings))
     print_rows(list(projection_rows(computed)), f"{settings.projected}, computed, not measured")

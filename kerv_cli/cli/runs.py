@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask; names must be whole.")]
-To = Annotated[str, typer.Option("--to", help="csv, parquet, db or trace.")]
+To = Annotated[str, typer.Option("--to", help="csv, parquet or db.")]
 Folder = Annotated[Path | None, typer.Option("--dir", help="Folder to write to; default results/exports/FORMAT.")]
 
 
@@ -294,13 +294,13 @@ def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
 def export(
     settings: CommandSettings, names: list[str], to: To = "csv", folder: Folder = None, as_json: AsJson = False
 ) -> None:
-    """Write the episodes of a run as CSV, Parquet, a trace, or a database that 'kerv runs import' reads.
+    """Write the episodes of a run as CSV, Parquet, or a database that 'kerv runs import' reads.
 
     NAME: runs (id, a unique part of it, or last) and results=DIR.
 
     Examples:
         kerv runs export last
-        kerv runs export main --to trace
+        kerv runs export main --to parquet
     """
     from kerv_cli.catalogue.entries import find_run
     from kerv_cli.report.export import export as hand_over

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import choice, number, setting
@@ -48,20 +47,6 @@ class TargetSettings:
             raise UsageError(f"{prefix}width={self.width} must be a multiple of 2 x {prefix}heads={self.heads}")
         if self.observation == "vision" and self.image_size % (8 * self.grid):
             raise UsageError(f"{prefix}image_size={self.image_size} must be a multiple of 8 x {prefix}grid={self.grid}")
-
-
-def prompt_tokens(target: Mapping[str, Any]) -> int | None:
-    """Return P, the number of prompt tokens of a compact or grown target. None if the target is of another family.
-
-    Args:
-        target: Content of the target's `target.json`.
-    """
-    own = target.get("settings", {})
-    if not {"grid", "instruction_tokens", "scene_tokens"} <= set(own):
-        return None
-    views = len(target["cameras"]) if own.get("observation") != "state" else 0
-    prompt: int = own["grid"] ** 2 * views + own["instruction_tokens"] + own["scene_tokens"] + 1
-    return own.get("grown", {}).get("prompt") or prompt
 
 
 @dataclass
