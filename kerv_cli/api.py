@@ -19,6 +19,7 @@ import pandas as pd
 
 from kerv_cli.base.config import as_overrides, compose
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
+from kerv_cli.base.wire import Message
 from kerv_cli.catalogue.entries import RunEntry, find_run, find_runs, matching, store_of
 from kerv_cli.episodes.resolve import resolve, resolve_rollout, study_name
 from kerv_cli.lab.command import chosen_store
@@ -30,7 +31,6 @@ from kerv_cli.report.measures import Row, averaged, frame_of
 from kerv_cli.report.report import report as write_reports
 from kerv_cli.report.tables import load_study as load_data
 from kerv_cli.report.viewing import save_recording
-from kerv_cli.serve.interface import Message
 from kerv_cli.serve.openpi import EXECUTED, RESET, OpenPi, metadata
 from kerv_cli.serve.policy import Policy as Served
 from kerv_cli.serve.settings import ServeSettings

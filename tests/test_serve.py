@@ -23,10 +23,10 @@ from websockets.sync.client import connect
 from kerv_cli.base.config import compose as compose_settings
 from kerv_cli.base.files import read_json, write_json
 from kerv_cli.base.spaces import Observation
+from kerv_cli.base.wire import packed, unpacked
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.settings import PolicySettings
-from kerv_cli.serve.interface import packed, unpacked
 from kerv_cli.serve.openpi import OpenPi, observation_of
 from kerv_cli.serve.policy import Finite, Policy
 from kerv_cli.serve.server import PolicyServer

@@ -13,8 +13,9 @@ import numpy as np
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import Observation
+from kerv_cli.base.wire import Message, packed, unpacked
 from kerv_cli.report.tally import Tally
-from kerv_cli.serve.interface import Interface, Message, hand_of, keys_of, packed, text_of, unpacked
+from kerv_cli.serve.interface import Interface, hand_of, keys_of, text_of
 from kerv_cli.serve.policy import Conversation, Policy
 
 STATE, IMAGE, PROMPT, RESET, EXECUTED = "observation/state", "observation/image", "prompt", "reset", "executed"

@@ -18,9 +18,10 @@ import numpy as np
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.paths import results_dir
 from kerv_cli.base.spaces import Observation
+from kerv_cli.base.wire import Message, packed, unpacked
 from kerv_cli.catalogue.evaluations import path_of, write_served
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
-from kerv_cli.serve.interface import OPEN, Interface, Message, hand_of, keys_of, packed, text_of, unpacked
+from kerv_cli.serve.interface import OPEN, Interface, hand_of, keys_of, text_of
 from kerv_cli.serve.policy import Conversation, Policy
 
 PROTOCOL_VERSION = 1
