@@ -1,11 +1,8 @@
 """The board's pages of episodes and failures, their films and recordings, in a real browser."""
 
-import contextlib
 import html
 import io
-import json
 import shlex
-import sqlite3
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -172,23 +169,6 @@ def test_the_command_on_the_page_repeats_the_episode(rolled):
         )
     finally:
         newest.remove()
-
-
-def test_an_imported_episode_has_a_page_and_no_film(tmp_path, client):
-    recording = tmp_path / "recording-1.sqlite"
-    with contextlib.closing(sqlite3.connect(recording)) as file, file:
-        file.execute("CREATE TABLE eval_metadata (eval_id, metadata)")
-        file.execute("CREATE TABLE work_queue (eval_id)")
-        columns = "eval_id, task_name, episode_id, metrics, steps, elapsed_sec, eid, failure_reason"
-        file.execute(f"CREATE TABLE episode_results ({columns})")
-        file.execute("INSERT INTO eval_metadata VALUES ('1', ?)", (json.dumps({"benchmark": "LIBERO"}),))
-        file.execute("INSERT INTO episode_results VALUES ('1', 'bowl', 0, '{\"success\": false}', 9, 1.0, 'a', '')")
-    kerv("runs", "import", str(recording), "name=libero", f"results={tmp_path}")
-    (number,) = rows_of_wanted(opened(tmp_path))
-    text = client.get(f"/episodes/{number}").text
-    assert text.count("another program ran it") == 2
-    assert client.post(f"/episodes/{number}/record").status_code == 409
-    assert "unknown" in client.get("/studies/libero/failures").text
 
 
 def test_settings_that_adapt_are_repeated_with_the_episodes_before(tmp_path):

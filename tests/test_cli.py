@@ -39,10 +39,6 @@ FAST = ["episodes=2", "world.horizon=8", "record=0"]
         (f"{INVOKE}['train', 'drafter', '--help'])", "torch numpy hydra pydantic"),
         (f"{INVOKE}['rollout', 'nonsense.key=1'])", "torch numpy pydantic"),
         (f"{INVOKE}['sweep', 'study=demo', 'nonsense.key=1'])", "torch numpy pydantic"),
-        (
-            "from kerv_cli.worlds.vla_eval import MetaWorld as M; M(tasks=['MT10'], stress='push').get_tasks()",
-            "torch mujoco metaworld",
-        ),
     ],
 )
 def test_nothing_heavy_is_imported_before_it_is_needed(code, heavy):

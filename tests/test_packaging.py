@@ -245,7 +245,7 @@ def test_the_lock_files_hold_a_hash_of_every_requirement(metadata):
             requirement = Requirement(line)
             pinned[canonicalize_name(requirement.name)] = str(requirement.specifier).removeprefix("==")
     assert locked("cpu", "torch") == f"torch=={pinned['torch']}+cpu"
-    extras = {"lerobot", "openvla", "postgres", "serve", "viewer", "vla-eval", "dev", ""}
+    extras = {"lerobot", "openvla", "postgres", "serve", "viewer", "dev", ""}
     for requirement in map(Requirement, metadata.get_all("Requires-Dist") or []):
         if requirement.name != "kerv" and any(
             requirement.marker is None or requirement.marker.evaluate({"extra": extra}) for extra in extras

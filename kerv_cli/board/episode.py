@@ -35,7 +35,6 @@ from kerv_cli.board.pages import CONTENT_POLICY, database_of, inside, render
 from kerv_cli.catalogue.episodes import FoundEpisode, find_episode, outcomes
 from kerv_cli.engine.record import PHASES, DecodeRecord
 from kerv_cli.episodes.identity import Setting
-from kerv_cli.lab.store import IMPORT
 from kerv_cli.report.viewing.token_outcomes import OUTCOMES, chunk_size, outcomes_of, token_names, tokens_hash
 from kerv_cli.report.viewing.viewer import Film, animation, film_of, viewer_command
 from kerv_cli.worlds import specs
@@ -178,8 +177,6 @@ def command_of(found: FoundEpisode) -> tuple[str, str]:
     from kerv_cli.episodes.repeat import repeating_words  # imports torch, which takes seconds
 
     episode, results = found.episode, str(found.store.database.results)
-    if found.store.kind == IMPORT:
-        return "", "it was imported: another program ran it"
     setting, seeds = episode.setting, [*found.earlier, episode.seed]
     try:
         words = repeating_words(setting.settings, setting.identity, setting.overrides, episode.task, seeds)
@@ -230,7 +227,7 @@ def _film_values(
     """
     job = RECORDER.job(found.recording)
     values: dict[str, Any] = {"found": found, "step": step, "job": job, "film": None, "same": None, "rerun": ""}
-    values |= {"slower": SLOWER, "imported": found.store.kind == IMPORT, "missing": "" if has_rerun() else NO_RERUN}
+    values |= {"slower": SLOWER, "missing": "" if has_rerun() else NO_RERUN}
     if has_rerun() and found.recording.exists() and (job is None or job.future.done()):
         film = film_of(inside(request, found.recording))
         if film.facts.get("tokens"):
@@ -250,13 +247,8 @@ async def record(request: Request) -> Response:
 
     The recording process is started in this function's thread, which lives as long as the board. The other threads,
     which make pages, end earlier. The kernel ends a process when the thread that started it ends (`begin_worker`).
-
-    Raises:
-        HTTPException: The episode was imported.
     """
     found = await run_in_threadpool(_found, request)
-    if found.store.kind == IMPORT:
-        raise HTTPException(409, "an imported episode cannot be recorded: another program ran it")
     RECORDER.record(found)
     return await run_in_threadpool(show_film, request)
 

@@ -30,13 +30,13 @@ from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.lab.database import ABOUT, EPISODES, SETTINGS, STUDIES, WANTED, Database
 from kerv_cli.lab.plan import ALL
 from kerv_cli.lab.runs import COMPLETE, RUNNING, RunRow, forget, interrupted, run_rows, time_left
-from kerv_cli.lab.store import IMPORT, ROLLOUT, SWEEP, Study
+from kerv_cli.lab.store import ROLLOUT, SWEEP, Study
 
 LOG, WEIGHTS = "log.csv", "model.safetensors"
 """Names of the files that a training writes: the log of its validations, and the weights."""
 LAST = "last"
 """Argument of commands that stands for the newest entry."""
-_STUDIES = (SWEEP, ROLLOUT, IMPORT)
+_STUDIES = (SWEEP, ROLLOUT)
 _STATES = ("complete", "begun", "damaged", "step ", "running", "interrupted", "failed")
 LABELS = ("tag", "note")
 """Kinds of labels that people give to a run. `tag` is a list of words, separated by commas. `note` is free text."""
@@ -56,7 +56,7 @@ class RunEntry:
 
     Attributes:
         id: Name by which commands find the entry.
-        kind: sweep, rollout, import, or a kind of artifact.
+        kind: sweep, rollout, or a kind of artifact.
         folder: Folder of the entry's files.
         started: Start time in UTC (ISO 8601). For an artifact, the time when its newest file changed.
         state: For example `complete`, `interrupted, 2 of 6 episodes`, `step 300 of 600`, `begun` or `damaged`.
@@ -107,7 +107,7 @@ class RunEntry:
 
     @property
     def has_episodes(self) -> bool:
-        """Whether the entry is a study: a sweep, a rollout or an import."""
+        """Whether the entry is a study: a sweep or a rollout."""
         return self.kind in _STUDIES
 
     @property
@@ -250,7 +250,7 @@ def store_of(run: RunEntry, database: Database) -> Study:
         database: The database that `find_run` found it in.
 
     Raises:
-        UsageError: The entry is not a sweep, rollout or import.
+        UsageError: The entry is not a sweep or rollout.
     """
     if not run.has_episodes:
         raise UsageError(f"{run.id} is a {run.kind}: it has no episodes")

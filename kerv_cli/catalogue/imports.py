@@ -73,16 +73,12 @@ def import_databases(database: Database, files: Sequence[Path], name: str = "") 
     return names, notes
 
 
-def database_in(path: Path) -> Path | None:
-    """Return the database file: a file `path` ending in .db, or kerv.db in a folder `path`. None if there is neither.
-
-    Raises:
-        UsageError: The path does not exist.
-    """
-    if not path.exists():
-        raise UsageError(f"{path} does not exist: name a results folder, a kerv.db, or a recording of vla-eval")
+def database_in(path: Path) -> Path:
+    """Return the database file: a file `path` that ends in .db, or kerv.db in a folder `path`."""
     file = path / FILE if path.is_dir() else path
-    return file if file.is_file() and file.suffix == Path(FILE).suffix else None
+    if not file.is_file() or file.suffix != Path(FILE).suffix:
+        raise UsageError(f"{path} holds no database: name a results folder or a kerv.db")
+    return file
 
 
 def connect_foreign(path: Path) -> sqlite3.Connection:

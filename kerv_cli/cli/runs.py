@@ -317,50 +317,28 @@ def export(
 
 @dataclass(kw_only=True)
 class ImportSettings(CommandSettings):
-    """Settings of `kerv runs import`. They apply only to recordings of vla-eval (docs/vla_eval.md)."""
+    """Settings of `kerv runs import`."""
 
-    name: str = setting("", "name of the study; empty: the names of its benchmarks")
-    baseline: str = setting("", "label of the setting that others are compared with; empty: ar, else the first one")
-    labels: list[str] = setting([], "label of each recording, in order; empty: its method, or the name of its server")
+    name: str = setting("", "new name of the study; empty: studies keep their names")
 
 
-@command("runs import", ImportSettings, keys="name baseline labels results")
+@command("runs import", ImportSettings, keys="name results")
 def import_(settings: ImportSettings, names: list[str], overrides: list[str], as_json: AsJson = False) -> None:
-    """Import the runs of another results folder, or evaluations of vla-eval as a study.
+    """Import the studies of another results folder.
 
-    NAME: a kerv.db, vla-eval's recording-….sqlite, or folders that hold one.
+    NAME: kerv.db files, or folders that hold one.
 
     Examples:
-        kerv runs import ar/recording-1.sqlite kerv/recording-2.sqlite
         kerv runs import old-results
+        kerv runs import old-results/kerv.db name=theirs
     """
-    from kerv_cli.catalogue.evaluations import import_evaluations
     from kerv_cli.catalogue.imports import database_in, import_databases
-    from kerv_cli.lab.store import Study
-    from kerv_cli.report.summary import SummaryTable
-    from kerv_cli.report.tables import load_study
 
     if not names:
-        raise UsageError("name what to import: kerv runs import old-results, or kerv runs import recording-ID.sqlite")
-    paths = list(map(as_path, names))
-    files = list(filter(None, map(database_in, paths)))
-    database = database_of(settings)
-    if files:
-        if len(files) < len(paths):
-            raise UsageError("import results folders and evaluations one after the other")
-        studies, notes = import_databases(database, files, settings.name)
-        if as_json:
-            end_with_json({"studies": studies, "notes": notes})
-        for line in [*notes, f"imported {', '.join(studies) or 'nothing'}: 'kerv runs list' shows what is there"]:
-            typer.echo(with_results(line, overrides))
-        return
-    words = ["runs", "import", *names]
-    name, notes = import_evaluations(database, paths, settings.name, settings.labels, settings.baseline, words)
-    data = load_study(Study(database, name))
+        raise UsageError("name what to import: 'kerv runs import old-results'")
+    files = [database_in(as_path(name)) for name in names]
+    studies, notes = import_databases(database_of(settings), files, settings.name)
     if as_json:
-        end_with_json({"study": name, "notes": notes, "settings": data.table})
-    for line in notes:
-        typer.echo(line)
-    console().print(SummaryTable(data.results))
-    report = f"kerv report study={name}{results_word(overrides)}"
-    typer.echo(f"study {name}: {report}, {report} --choose")
+        end_with_json({"studies": studies, "notes": notes})
+    for line in [*notes, f"imported {', '.join(studies) or 'nothing'}: 'kerv runs list' shows what is there"]:
+        typer.echo(with_results(line, overrides))

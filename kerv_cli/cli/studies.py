@@ -243,8 +243,8 @@ def print_study(data: StudyData, all_columns: bool = False, how: str = "", expla
         typer.echo(f"its episodes are of {len(codes)} states of the code, commits {names}")
     apart = not_in_turn(data.results)
     if apart:
-        mend = "" if study.kind == "import" else f"; '{study.sweep_command('rerun=timed')}' does that"
-        typer.echo(f"no speedup of {', '.join(apart)}: not measured in turn with the baseline{mend}")
+        mend = study.sweep_command("rerun=timed")
+        typer.echo(f"no speedup of {', '.join(apart)}: not measured in turn with the baseline; '{mend}' does that")
     if data.study.note:
         typer.echo(f"\n{data.study.note}\n")
 
@@ -274,7 +274,5 @@ def print_verdict(report: Report) -> None:
     typer.echo(f"page: {report.files[-1]}")
     typer.echo(f"browse: kerv board{results_word(study.database.words)}")
     recordings = study.recordings
-    mend = "" if study.kind == "import" else "; the same sweep with record=1 rerun=all does that"
-    typer.echo(
-        f"watch: {shlex.join(['kerv', 'view', str(recordings[0])]) if recordings else f'nothing is recorded{mend}'}"
-    )
+    nothing = "nothing is recorded; the same sweep with record=1 rerun=all does that"
+    typer.echo(f"watch: {shlex.join(['kerv', 'view', str(recordings[0])]) if recordings else nothing}")

@@ -51,7 +51,7 @@ def _is_time(text: str) -> bool:
 
 
 def _is_kind(text: str) -> bool:
-    return text in ("sweep", "rollout", "import")
+    return text in ("sweep", "rollout")
 
 
 class _Checked(sa.types.TypeDecorator[Any]):

@@ -41,9 +41,9 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-SWEEP, ROLLOUT, IMPORT = "sweep", "rollout", "import"
-"""Kinds of studies, made by `kerv sweep`, `kerv rollout` and `kerv runs import`."""
-_FOLDERS = {SWEEP: "studies", ROLLOUT: "rollouts", IMPORT: "studies"}
+SWEEP, ROLLOUT = "sweep", "rollout"
+"""Kinds of studies, made by `kerv sweep` and `kerv rollout`."""
+_FOLDERS = {SWEEP: "studies", ROLLOUT: "rollouts"}
 _AT_ONCE = 500  # most values in one SQL IN (…)
 ABOUT = ("title", "baseline", "axis", "note", "block", "machines")
 """Fields of a `Study` that are stored as one JSON value."""
@@ -51,7 +51,7 @@ ABOUT = ("title", "baseline", "axis", "note", "block", "machines")
 
 @dataclass(frozen=True)
 class ImportedEpisode:
-    """An episode from another program or another database, to be imported.
+    """An episode from another database, to be imported.
 
     Attributes:
         episode: Setting, task and seed in the study.

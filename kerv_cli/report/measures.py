@@ -341,7 +341,7 @@ def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame
     """Pair each setting's episodes with the episodes of its baseline.
 
     Two episodes form a pair if they have the same task, seed, initial state, device, number format and number
-    of threads. Episodes from another project's policy server name no device. They pair with episodes of any device.
+    of threads.
 
     Args:
         episodes: Episodes of all settings and baselines.
@@ -367,9 +367,8 @@ def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame
     other = other.rename(columns={"label": "baseline"})
     both = method.merge(other, on=["baseline", *keys], suffixes=("_method", "_baseline"))
     agree = both["initial_state_method"] == both["initial_state_baseline"]
-    elsewhere = (both["device_name_method"] == "") | (both["device_name_baseline"] == "")
     for name in COMPARABLE:
-        agree &= elsewhere | (both[f"{name}_method"] == both[f"{name}_baseline"])
+        agree &= both[f"{name}_method"] == both[f"{name}_baseline"]
     both = both[agree].sort_values(keys, kind="stable").reset_index(drop=True)
     won, reference = both["success_method"].astype(bool), both["success_baseline"].astype(bool)
     return both.assign(

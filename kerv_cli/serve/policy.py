@@ -137,7 +137,7 @@ class Policy:
         return record
 
     def facts(self) -> dict[str, object]:
-        """Return what is stored with each served episode: settings, hashes of the policy's files, and the machine."""
+        """Return settings, hashes of the policy's files, and the machine, for the server's greeting."""
         shared = {setting.name: getattr(self.settings, setting.name) for setting in fields(MethodSettings)}
         settings = asdict(RolloutSettings(**shared))
         settings["runtime"]["device"] = self.artifacts.device

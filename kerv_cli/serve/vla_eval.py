@@ -10,23 +10,19 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime
 from importlib.metadata import version
 
 import numpy as np
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.paths import results_dir
 from kerv_cli.base.spaces import Observation
 from kerv_cli.base.wire import Message, packed, unpacked
-from kerv_cli.catalogue.evaluations import path_of, write_served
-from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
 from kerv_cli.serve.interface import OPEN, Interface, hand_of, keys_of, text_of
 from kerv_cli.serve.policy import Conversation, Policy
 
 PROTOCOL_VERSION = 1
 MOST_STEPS = 20_000
-"""Largest number of control steps of an episode. It limits the episode's record, which grows with every step."""
+"""Largest number of control steps of an episode."""
 _FORMATS = {("position", 3): "delta_xyz", ("rotation", 3): "axis_angle"}
 """(Name of a group of DoFs, number of DoFs) -> vla-eval's name for the format of the group's values."""
 
@@ -76,17 +72,13 @@ class _Episode:
     """An episode in progress. `payload` is the content of the message that starts the episode."""
 
     def __init__(self, payload: Message) -> None:
-        task, ids = (value if isinstance(value, dict) else {} for value in map(payload.get, ("task", "recording")))
+        task = payload.get("task")
+        task = task if isinstance(task, dict) else {}
         seed, index = (value if isinstance(value, int) else 0 for value in map(task.get, ("seed", "episode_idx")))
         self.task, self.seed = str(task.get("name", "")), max(0, seed + index)
-        self.ids: Message = ids  # ids under which the benchmark records the episode; empty if it does not
-        self.started = datetime.now(UTC).isoformat(timespec="seconds")
-        self.instruction, self.begun = "", False
-        self.decodes: list[DecodeRecord] = []
-        self.decode_steps: list[int] = []
-        self.sent: list[np.ndarray] = []  # actions (D,)
+        self.begun, self.steps = False, 0
+        self.sent: np.ndarray | None = None  # (D,) the last action, until it is observed
         self.left: deque[np.ndarray] = deque()  # actions of the current chunk
-        self.path: list[np.ndarray] = []  # (3,) metres, of the end effector before every action
 
 
 class VlaEval(Conversation):
@@ -155,88 +147,45 @@ class VlaEval(Conversation):
             UsageError: Something is wrong with the observation, or the episode already has MOST_STEPS control steps.
         """
         episode = self.episode = self.episode or _Episode({})
-        if len(episode.sent) >= MOST_STEPS:
+        if episode.steps >= MOST_STEPS:
             raise UsageError(f"the episode has {MOST_STEPS} control steps, the most: send episode_end or episode_start")
         numbers = self.interface.numbers(payload.get("state", payload.get("states")), "state", payload)
         state = Observation(*numbers)
-        hand, step = hand_of(state), len(episode.sent)
+        hand = hand_of(state)
         if not episode.begun:
             self.begin(self.policy.task or episode.task, episode.seed, hand)
             episode.begun = True
-        elif step == len(episode.path):
-            self.decoder.observe(episode.sent[-1], hand)
-        episode.path[step:] = [hand]  # replace the position that a failed observation of this step left
+        elif episode.sent is not None:
+            self.decoder.observe(episode.sent, hand)
+            episode.sent = None
         self.policy.check_range(state)
         if not episode.left:
-            record = self.policy.decode(self.decoder, self._observation(episode, payload, numbers))
-            episode.decodes.append(record)
-            episode.decode_steps.append(step)
+            record = self.policy.decode(self.decoder, self._observation(payload, numbers))
             episode.left.extend(record.actions)
         action, space = episode.left.popleft(), self.interface.space
-        episode.sent.append(np.clip(action, space.low, space.high).astype(np.float32))
+        episode.sent = np.clip(action, space.low, space.high).astype(np.float32)
+        episode.steps += 1
         sent = self.interface.converted(action[None])[0].astype(np.float32)
         return self._message("action", {"actions": sent})
 
-    def _observation(self, episode: _Episode, payload: Message, numbers: tuple[np.ndarray, np.ndarray]) -> Observation:
-        """Read the observation from a message.
-
-        Args:
-            episode: The current episode, whose instruction is updated.
-            payload: Content of the message.
-            numbers: Proprioception (p,) and simulator state (s,), already checked.
-
-        Raises:
-            UsageError: An image is missing or has a wrong size or type.
-        """
+    def _observation(self, payload: Message, numbers: tuple[np.ndarray, np.ndarray]) -> Observation:
+        """Read a message. `numbers`: proprioception (p,) and simulator state (s,), already checked."""
         images = payload.get("images")
         images = images if isinstance(images, dict) else {}
-        episode.instruction = text_of(payload.get("task_description", ""), "task_description")
+        instruction = text_of(payload.get("task_description", ""), "task_description")
         frames = {}
         for camera in self.interface.cameras:
             if camera not in images:
                 raise UsageError(f"no image of camera {camera}: the message has images of {keys_of(images)}")
             frames[camera] = self.interface.image(images[camera], camera, f"images.{camera}")
-        return Observation(*numbers, episode.instruction, frames)
+        return Observation(*numbers, instruction, frames)
 
     def _end(self, payload: Message) -> None:
-        """End the episode. Store its record if the benchmark records episodes."""
+        """End the episode, and tell the method's parts whether it succeeded."""
         episode, self.episode = self.episode, None
-        metrics, elapsed = payload.get("metrics"), payload.get("elapsed_sec")
-        metrics = metrics if isinstance(metrics, dict) else {}
-        if episode is None or not episode.decodes:
-            return
-        success = bool(metrics.get("success"))
-        self.decoder.finish(success)
-        names = (str(episode.ids.get(key, "")) for key in ("eval_id", "eid"))
-        path = path_of(results_dir(self.policy.settings.results), *names)
-        if path is None:
-            return
-        last = metrics.get("end_effector")
-        if isinstance(last, list) and len(last) == 3 and all(isinstance(x, float) for x in last):
-            episode.path.append(np.array(last))
-        record = self._record(episode, success, float(elapsed) if isinstance(elapsed, int | float) else 0.0)
-        write_served(path, record, episode.started, self.policy.facts())
-
-    def _record(self, episode: _Episode, success: bool, elapsed: float) -> EpisodeRecord:
-        """Return the record of a finished episode. `elapsed` is its duration in seconds."""
-        interface, steps = self.interface, len(episode.sent)
-        has_hand = len(interface.observation.proprioception) >= 3 and not interface.images_alone
-        return EpisodeRecord(
-            environment=self.policy.description.environment,
-            space=interface.space,
-            task=episode.task,
-            instruction=episode.instruction,
-            seed=episode.seed,
-            success=success,
-            steps=steps,
-            decodes=tuple(episode.decodes),
-            decode_steps=tuple(episode.decode_steps),
-            actions=np.stack(episode.sent),
-            path=np.stack(episode.path).astype(np.float32) if has_hand else np.zeros((0, 3), np.float32),
-            gripper=np.ones(steps + 1, np.float32),
-            initial_state=np.zeros(0),
-            wall_seconds=elapsed,
-        )
+        metrics = payload.get("metrics")
+        if episode is not None and episode.begun:
+            self.decoder.finish(bool(isinstance(metrics, dict) and metrics.get("success")))
 
 
 _HANDLERS: Mapping[str, Callable[[VlaEval, Message], bytes | None]] = {
