@@ -152,27 +152,6 @@ def test_a_sweep_resumes_with_more_episodes(results, tmp_path):
     assert "3 run, 6 reused, 0 failed" in kerv(*more).stdout
 
 
-def test_two_counts_are_compared_without_a_run():
-    unpaired, paired = (
-        json.loads(kerv("compare", "17/20", "14/20", *words, "--json").stdout) for words in ([], ["lost=4", "won=1"])
-    )
-    assert unpaired["difference"]["low"] < paired["difference"]["low"] < 0 < paired["difference"]["high"]
-    assert (unpaired["p"], paired["p"]) == (None, 0.375)
-    assert "No difference is shown" in kerv("compare", "17/20", "14/20").stdout
-    # the interval alone would show a difference; the exact test does not
-    assert "does not confirm" in kerv("compare", "20/20", "15/20", "lost=5").stdout
-    assert "less often" in kerv("compare", "20/20", "10/20", "lost=10").stdout
-    for words in (["17/20", "14/20", "lost=4"], ["17/20", "14/20", "lost=3.5", "won=0.5"], ["21/20", "3/4"], ["3/4"]):
-        refusal("compare", *words, code=2)
-    few, many = json.loads(kerv("power", "0.90", "19/20", "--json").stdout)
-    assert (few["lost"], many["won"]) == (0, pytest.approx(0.095))
-    kerv("power", "0.1", "0.9", "lost=0.1")
-    (given,) = json.loads(kerv("power", "0.90", "0.95", "lost=0.02", "--json").stdout)
-    assert few["pairs"] < given["pairs"] < many["pairs"]
-    for words in (["90", "95"], ["0.9", "0.9"], ["0.9", "0.95", "lost=0.3"], ["0.9", "x"]):
-        refusal("power", *words, code=2)
-
-
 def test_typer_completes_keys_and_names():
     def completed(*words, shell="zsh"):
         line = " ".join(("kerv", *words))

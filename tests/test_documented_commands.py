@@ -119,7 +119,7 @@ def check_runs(command: str) -> None:
     """Run a command as far as its settings, in the current folder."""
     words = [_OPEN.get(word, word) for word in shlex.split(command)[1:]]  # what a page leaves to the reader
     runner = CliRunner()
-    if words[0] in ("runs", "--version", "compare", "power"):
+    if words[0] in ("runs", "--version"):
         result = runner.invoke(app, [*words[:2], "--help"] if words[0] == "runs" else words)
         options = [word for word in words if word.startswith("--")]
         assert all(option in result.output for option in options if words[0] == "runs"), command

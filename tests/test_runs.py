@@ -112,17 +112,6 @@ def test_labels_are_listed_shown_exported_and_removed(copy):
     assert labels_in(opened(copy)) == {}
 
 
-def test_a_run_is_watched_until_it_ends(copy, monkeypatch):
-    with contextlib.ExitStack() as stack:
-        record = stack.enter_context(Run(opened(copy), "target", "nano-state", ["train", "target"], total=20))
-        record.beat(5, 40)
-        monkeypatch.setattr("kerv_cli.cli.runs.time.sleep", lambda seconds: stack.close())
-        lines = works("runs", "watch", f"results={copy}").splitlines()
-    assert re.fullmatch(r"target/nano-state, running, 5 of 40, about \d+ s left", lines[0])
-    assert lines[1:] == ["target/nano-state, complete"]
-    assert works("runs", "watch", f"results={copy}") == f"nothing runs in {copy}\n"
-
-
 def test_runs_are_listed_and_filtered(results):
     runs = listed(results)
     assert [run["kind"] for run in runs].count("rollout") == 2

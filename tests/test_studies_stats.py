@@ -8,17 +8,14 @@ import numpy as np
 import pytest
 from loaded import module_of
 from scipy.special import stdtrit
-from scipy.stats import binom
 from statsmodels.stats.contingency_tables import mcnemar as statsmodels_mcnemar
-from statsmodels.stats.proportion import confint_proportions_2indep, proportion_confint
+from statsmodels.stats.proportion import proportion_confint
 
 from kerv_cli.report.statistics import (
     PairedCounts,
-    difference,
     mcnemar,
     mean_of,
     paired_difference,
-    pairs_for_power,
     pairs_to_settle,
     speedup,
     wilson,
@@ -41,28 +38,6 @@ def test_without_data_nothing_is_estimated():
     assert math.isnan(speedup(np.array([]), np.array([]), []).value)
     single = speedup(np.array([2.0]), np.array([1.0]), ["a"])
     assert (single.value, math.isnan(single.low), math.isnan(single.high)) == (2.0, True, True)
-
-
-@pytest.mark.parametrize(("a", "b"), [((17, 20), (14, 20)), ((0, 10), (3, 40)), ((5, 5), (9, 9))])
-def test_the_difference_of_independent_rates_is_that_of_statsmodels(a, b):
-    found = difference(wilson(*a), wilson(*b))
-    assert found.value == pytest.approx(b[0] / b[1] - a[0] / a[1])
-    assert (found.low, found.high) == pytest.approx(confint_proportions_2indep(*b, *a, method="newcomb"), abs=1e-12)
-
-
-@pytest.mark.parametrize(("lost", "won"), [(0.0, 0.2), (0.15, 0.35), (0.4, 0.1)])
-def test_the_planned_pairs_are_the_fewest_with_which_the_exact_test_has_its_power(lost, won):
-    def power(pairs):
-        total = 0.0
-        for discordant in range(pairs + 1):
-            shown = [x for x in range(discordant + 1) if mcnemar(PairedCounts(0, x, discordant - x, 0)) <= 0.05]
-            shown_share = binom.pmf(shown, discordant, lost / (lost + won)).sum()
-            total += binom.pmf(discordant, pairs, lost + won) * shown_share
-        return total
-
-    pairs = int(pairs_for_power(lost, won))
-    assert power(pairs - 1) < 0.8 <= power(pairs)
-    assert pairs_for_power(0.0495, 0.0505) == math.inf
 
 
 def test_macro_speedup_weighs_groups_equally():

@@ -27,9 +27,7 @@ from kerv_cli.base.errors import KervError, UnknownName, UsageError
 
 PLUGINS = "KERV_PLUGINS"
 
-_COMMANDS = (
-    "demos train prepare build calibrate rollout sweep work serve report runs board compare view estimate bench doctor"
-)
+_COMMANDS = "demos train prepare build calibrate rollout sweep work serve report runs board view estimate bench doctor"
 
 MODULES: Mapping[str, Sequence[str]] = {
     "command": tuple(f"kerv_cli.cli.{name}" for name in _COMMANDS.split()),

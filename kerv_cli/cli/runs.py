@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import asdict, dataclass
 from itertools import starmap
 from operator import attrgetter
@@ -155,37 +154,6 @@ def label(settings: CommandSettings, names: list[str]) -> None:
     run = find_run(database, name)
     set_labels(database, run.id, run.labels | changes)
     typer.echo(", ".join([run.id, *(f"{kind} {text}" for kind, text in (run.labels | changes).items() if text)]))
-
-
-@command("runs watch", writes=False)
-def watch(settings: CommandSettings, names: list[str]) -> None:
-    """Follow what runs, from any terminal, until it ends: how far it is, and how long it takes.
-
-    NAME: a run (id, or a unique part of it) and results=DIR. Without a name: all that are running.
-
-    Examples:
-        kerv runs watch
-        kerv runs watch main
-    """
-    from kerv_cli.catalogue.entries import find_run, find_runs
-    from kerv_cli.lab.runs import BEAT_SECONDS
-
-    database, shown = database_of(settings), dict[str, str]()
-    chosen = find_run(database, _run_names(names)[0]).id if names else ""
-    while True:
-        runs = {run.id: run for run in find_runs(database) if chosen in ("", run.id)}
-        running = [name for name, run in runs.items() if run.is_running]
-        for name in dict.fromkeys([*shown, *running]):
-            run = runs.get(name)
-            line = ", ".join(filter(None, (name, run.state, run.left))) if run else f"{name} is gone"
-            if shown.get(name) != line:
-                typer.echo(line)
-            shown[name] = line
-        if not running:
-            break
-        time.sleep(BEAT_SECONDS)
-    if not shown:
-        typer.echo(f"{chosen} does not run: {runs[chosen].state}" if chosen else f"nothing runs in {settings.results}")
 
 
 @command("runs compare", writes=False)

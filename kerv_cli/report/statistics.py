@@ -125,52 +125,6 @@ def paired_difference(counts: PairedCounts) -> Estimate:
     return Estimate(difference, low, high)
 
 
-def difference(first: Estimate, second: Estimate) -> Estimate:
-    """Estimate the difference of two independent success rates: the second rate minus the first.
-
-    With Wilson intervals this is Newcombe's hybrid score interval (Statistics in Medicine 17, 1998, page 873, method
-    10). The distance from the difference to its lower end is the root of the sum of two squared distances: from the
-    second rate to its lower end, and from the first rate to its upper end. For the upper end of the difference, the
-    distances are to the second rate's upper end and to the first rate's lower end.
-
-    Args:
-        first: The first rate, with its interval.
-        second: The second rate, with its interval. All intervals have the same confidence, the result's too.
-    """
-    value = second.value - first.value
-    low = value - math.hypot(second.value - second.low, first.high - first.value)
-    return Estimate(value, low, value + math.hypot(second.high - second.value, first.value - first.low))
-
-
-def pairs_for_power(lost: float, won: float) -> float:
-    """Return about how many pairs McNemar's exact test needs to show a difference at the 5 % level, with 80 % power.
-
-    A pair is one episode of the baseline and one of the method, from the same initial state. It is discordant if
-    exactly one of the two succeeds. The number of discordant pairs is treated as random.
-
-    Args:
-        lost: Expected share of pairs in which only the baseline succeeds.
-        won: Expected share of pairs in which only the method succeeds.
-
-    Returns:
-        The number of pairs. Infinite if more than MOST_PAIRS are needed.
-    """
-    from scipy.special import bdtr, bdtrik
-
-    discordant = np.arange(MOST_PAIRS + 1)
-    limit = np.floor(bdtrik(0.025, discordant, 0.5))  # of the rarer outcome; the test rejects up to here
-    limit -= bdtr(limit, discordant, 0.5) > 0.025
-    share = won / (lost + won)
-    tails = bdtr(limit, discordant, share) + bdtr(limit, discordant, 1 - share)
-    rejects = np.where(limit >= 0, tails, 0.0)
-
-    def reached(pairs: int) -> float:
-        return float(np.diff(bdtr(discordant[: pairs + 1], pairs, lost + won), prepend=0.0) @ rejects[: pairs + 1])
-
-    found = bisect.bisect_left(range(MOST_PAIRS + 1), True, key=lambda pairs: reached(pairs) >= 0.8)
-    return found if found <= MOST_PAIRS else math.inf
-
-
 def pairs_to_settle(counts: PairedCounts, margin: float) -> float:
     """Estimate how many pairs in all would show that the method loses less than `margin` of success (non-inferiority).
 
