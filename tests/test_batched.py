@@ -19,13 +19,12 @@ from test_episode import settings
 
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.chunk import Follower
-from kerv_cli.engine.cost import Profile
-from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.decoder import BatchDecoder, Decoder, Parts
 from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.record import UNTIMED, EpisodeRecord
 from kerv_cli.episodes import runner as run
+from kerv_cli.episodes.cost import Profile
 from kerv_cli.episodes.identity import Setting
 from kerv_cli.episodes.runner import Request, run_together
 from kerv_cli.lab.plan import Episode, blocks_of

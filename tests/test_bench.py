@@ -20,8 +20,8 @@ from kerv_cli.bench.measure import Laps, Phase, card_of, costs_of, decoders, mea
 from kerv_cli.bench.model import open_model
 from kerv_cli.bench.physics import Sizes
 from kerv_cli.bench.settings import BenchSettings
-from kerv_cli.engine.cost import READ_PHASES, Profile, Work, prices, read_profile, work_of, work_of_record
 from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.episodes.cost import READ_PHASES, Profile, Work, prices, read_profile, work_of, work_of_record
 from kerv_cli.methods.eagle.drafter import DrafterProposer
 from kerv_cli.targets.openvla.config import Language
 

@@ -25,8 +25,8 @@ from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import read_json, sha256_of, write_json
 from kerv_cli.base.paths import find_target
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
-from kerv_cli.engine.record import Measure, Round
+from kerv_cli.engine.chunk import Chunk, Follower
+from kerv_cli.engine.record import Round
 from kerv_cli.lab.database import Database
 from kerv_cli.methods.artifacts import MadeFor
 from kerv_cli.methods.calibration import (
@@ -189,7 +189,7 @@ def test_the_first_episodes_of_each_task_are_chosen(results):
 
 def test_variability_is_the_mean_difference_of_the_judged_tokens():
     """K by hand, in normalised action units; what is not judged does not count, nor does a strict DoF."""
-    chunk = Chunk(4, SPACE, Situation("t", ActionHistory(4)), None)  # type: ignore[arg-type]
+    chunk = Chunk(4, SPACE, Follower(SPACE), None)  # type: ignore[arg-type]
 
     def play(start, drafted, target_tokens):
         played = Round("verify", "x", start, drafted, target_tokens, 0, 1, len(drafted), ())
@@ -225,7 +225,7 @@ def test_a_run_writes_what_the_next_session_reads(results, target):
     assert "12 demonstrations of 2 tasks; 4 decodes per task" in plan
     path, made, notes = calibrated(results, "decodes=4", f"policy.target={target}")
     assert {row.decodes for row in made.variability.values()} == {4}
-    assert made.k_s("reach-v3", Measure(total=True)) == made.variability["reach-v3"].levels["sum of compared"]
+    assert made.k_s("reach-v3", "sum of compared") == made.variability["reach-v3"].levels["sum of compared"]
     folder = find_target(str(results), target)
     assert path == results / f"artifacts/calibration/{target}/calibration.json"
     loaded = CalibrationArtifact().checked(path, read_target(folder))
@@ -248,7 +248,7 @@ def test_a_calibration_is_completed_and_keeps_its_numbers(own):
     old = replace(made, noise=unfitted, variability=rows, boundary=replace(made.boundary, windows=ranges))
     write_json(path, dataclasses.asdict(old))
     with refused("sum of accepted tokens", "kerv calibrate complete=true", error=CheckpointError):
-        old.k_s("reach-v3", Measure(True, True))
+        old.k_s("reach-v3", "sum of accepted")
     _, completed, _ = calibrated(own, "decodes=4", "complete=true")
     assert completed.skip == old.skip
     for kind, noise in completed.noise.items():

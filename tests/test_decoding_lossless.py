@@ -14,13 +14,12 @@ from test_acceptance import space_of
 from kerv_cli.base.codes import FastCode
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.spaces import ActionSpace, Observation
-from kerv_cli.engine.batched import BatchDecoder
+from kerv_cli.engine.acceptance import ROOT
 from kerv_cli.engine.chunk import Chunk
-from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.decoder import BatchDecoder, Decoder, Parts
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import Target
-from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter, EagleNetwork
 from kerv_cli.methods.reuse import JacobiProposer, JacobiProposerSettings

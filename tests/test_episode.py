@@ -15,10 +15,10 @@ from examples.point_mass import SPEC, PointWorld
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.cost import Profile
 from kerv_cli.engine.record import PHASES, DecodeRecord, Delay, EpisodeRecord, Round
 from kerv_cli.episodes import policy as policies_of
 from kerv_cli.episodes import runner as run
+from kerv_cli.episodes.cost import Profile
 from kerv_cli.episodes.episode import RealClock, run_episode, steps_during
 from kerv_cli.episodes.policy import profiled
 from kerv_cli.episodes.rows import decodes_table, episode_row

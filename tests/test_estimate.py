@@ -12,8 +12,8 @@ from command import kerv, refusal, told
 
 from kerv_cli.bench.estimate import DRAFTS, LOOP, Draft, break_even, language_of, shape_of
 from kerv_cli.bench.physics import DEVICES, ENGINES, SHAPES, Sizes, priced
-from kerv_cli.engine.cost import prices, read_profile, work_of_record
 from kerv_cli.engine.record import DecodeRecord, Round
+from kerv_cli.episodes.cost import prices, read_profile, work_of_record
 
 ROOT = Path(__file__).resolve().parent.parent
 OPENVLA = priced(SHAPES["openvla-7b"], DEVICES["a100"], ENGINES["eager"])

@@ -10,8 +10,8 @@ from kerv_cli.base.codes import FastCode
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import BoundaryPart, part_of
 from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.acceptance import TokenTree
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.engine.tree import TokenTree
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.motion import MotionRule
@@ -70,8 +70,8 @@ def test_lookup_drafts_what_followed_in_the_last_chunk_and_loses_nothing():
         assert record.tokens == expected.tokens
         accepted += sum(one.accepted for one in record.rounds)
     assert accepted
-    chunk = fast._new_chunk(TARGET.encode(shown(0)), None)
-    chunk.situation.last[:] = [5, 6, 7, 5, 6, 8, 9]
+    chunk = fast._new_chunk(TARGET.encode(shown(0)))
+    chunk.episode.last = [5, 6, 7, 5, 6, 8, 9]
     for committed, drafted in (
         ([], [5, 6, 7]),
         ([5, 6], [7, 5, 6]),

@@ -19,7 +19,6 @@ from kerv_cli.base.config import compose
 from kerv_cli.base.settings import read_settings
 from kerv_cli.base.spaces import Observation
 from kerv_cli.catalogue.entries import find_runs, matching
-from kerv_cli.engine.chunk import ActionHistory, Situation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.settings import RolloutSettings
@@ -61,10 +60,9 @@ def test_it_is_lossless_wherever_it_drafts(place, mock, seed, chunk, depth, data
         "prefill_draft": Parts(prefill_draft=own, proposer=own),
         "merged": Parts(prefill_draft=MergedProposer([own], 40, [hold])),
     }[place]
-    decoder, history = Decoder(target, parts), ActionHistory(space.dofs)
+    decoder = Decoder(target, parts)
     if data.draw(st.booleans(), "executed"):
-        history.append(space.values_of(before[0]))
-    decoder.situation = Situation("t", history)
+        decoder.observe(space.unnormalise(space.values_of(before[0])), np.zeros(3))
     for _ in range(2):
         result = decoder.decode_prompt(prompt)
         assert result.tokens == truth

@@ -14,7 +14,7 @@ from command import kerv
 from kerv_cli.bench.physics import DEVICES, ENGINES, ROOFLINE, SHAPES, Device, priced
 from kerv_cli.bench.projections import ANCHORS, anchor_rows, projections
 from kerv_cli.bench.settings import BenchSettings
-from kerv_cli.engine.cost import FORWARDS, read_profile, source_costs
+from kerv_cli.episodes.cost import FORWARDS, read_profile, source_costs
 
 ROOT = Path(__file__).resolve().parent.parent
 OPENVLA = SHAPES["openvla-7b"]

@@ -14,7 +14,7 @@ from mock_target import MockTarget
 from test_decoding_lossless import plain_greedy
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.engine.chunk import WINDOW, ActionHistory, Chunk, Situation
+from kerv_cli.engine.chunk import WINDOW, Chunk, Follower
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import Proposer
@@ -43,18 +43,22 @@ def compensation(**values: Any) -> Compensation:
     return Compensation(CompensateSettings(**values), HOLD)
 
 
-def history_of(*actions: list[float]) -> ActionHistory:
-    history = ActionHistory(D)
+def follower_of(*actions: list[float]) -> Follower:
+    return followed(Follower(SPACE), *actions)
+
+
+def followed(follower: Any, *actions: list[float]) -> Any:
     for action in actions:
-        history.append(np.array(action))
-    return history
+        follower.observe(SPACE.unnormalise(np.array(action)), np.zeros(3))
+    return follower
 
 
-PAST = history_of([0.1, 0.2, 0.3, 1.0], [0.2, 0.1, 0.3, 1.0])
+ACTIONS = [0.1, 0.2, 0.3, 1.0], [0.2, 0.1, 0.3, 1.0]
+PAST = follower_of(*ACTIONS)
 
 
-def chunk_with(history: ActionHistory) -> Chunk:
-    return Chunk(N // D, SPACE, Situation("t", history), None)  # type: ignore[arg-type]
+def chunk_with(episode: Follower) -> Chunk:
+    return Chunk(N // D, SPACE, episode, None)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("known", range(N + 1))
@@ -90,7 +94,7 @@ def test_further_steps_are_predicted_from_the_accepted_prefix():
 
 
 def test_without_enough_history_the_target_decodes_on():
-    chunk = chunk_with(history_of())
+    chunk = chunk_with(follower_of())
     chunk.tokens = [1, 2]
     assert compensation().rectify(chunk) is None
 
@@ -166,8 +170,7 @@ def rejected_at(wrong: int) -> list[int]:
 
 def decoder_of(drafted: list[int], rectifier: Compensation) -> Decoder:
     decoder = Decoder(TARGET, Parts(prefill_draft=Known(drafted), rectifier=rectifier))
-    decoder.situation = Situation("t", PAST)
-    return decoder
+    return followed(decoder, *ACTIONS)
 
 
 @pytest.mark.parametrize("use_target_token", [True, False])
@@ -190,7 +193,7 @@ def test_a_filled_step_drops_nothing(wrong, use_target_token):
     rest = plain_greedy(TARGET, torch.cat([PROMPT, TARGET.embed(torch.tensor([known]))], 1))
     assert chunk.tokens == [*known, *rest][:N]
     step = first // D
-    last = SPACE.values_of(np.array(chunk.tokens[step * D - D : step * D])) if step else PAST.values()[-1]
+    last = SPACE.values_of(np.array(chunk.tokens[step * D - D : step * D])) if step else PAST.history()[-1]
     executed = SPACE.normalise(chunk.actions()).flatten()
     assert executed[list(filled)] == pytest.approx([last[index % D] for index in filled], abs=1e-6)
     assert decoder.parts.rectifier.resting == (5 if filled else 0)  # type: ignore[union-attr]
@@ -228,7 +231,7 @@ def test_what_the_rejected_draft_had_goes_before_the_prediction(wrong):
     expected = SPACE.values_of(np.array([*TRUTH[: wrong + 1], *drafted[wrong + 1 : end]]))
     if end > wrong + 1:
         # whatever was drafted for the gripper, and whether or not it was: as in the step before
-        expected[end - 1] = expected[end - 1 - D] if end > D else PAST.values()[-1][D - 1]
+        expected[end - 1] = expected[end - 1 - D] if end > D else PAST.history()[-1][D - 1]
     assert chunk.closed.reshape(-1) == pytest.approx(expected)
     assert chunk.compensated == end - wrong - 1
 
@@ -338,14 +341,12 @@ def test_a_short_history_gives_no_prediction(kind):
 
 
 def test_the_history_keeps_the_newest():
-    history = ActionHistory(DOFS, window=3)
-    assert history.values().shape == (0, DOFS)
-    for i in range(5):
-        history.append(np.full(DOFS, i / 10))
-    assert len(history.values()) == 3
-    np.testing.assert_allclose(history.values()[:, 0], [0.2, 0.3, 0.4])
-    extended = history.values(np.full((2, DOFS), 0.9))  # known steps of the chunk take the newest places
-    np.testing.assert_allclose(extended[:, 0], [0.4, 0.9, 0.9])
-    np.testing.assert_allclose(history.values()[:, 0], [0.2, 0.3, 0.4])
-    history = ActionHistory(DOFS, window=3)
-    np.testing.assert_allclose(history.values(np.full((1, DOFS), 0.9)), np.full((1, DOFS), 0.9))
+    past, one = [[i / 20] * DOFS for i in range(WINDOW + 2)], np.full((1, DOFS), 0.9)
+    follower = follower_of(*past)
+    newest = np.array(past[-WINDOW:])
+    np.testing.assert_allclose(follower.history(), newest)
+    extended = follower.history(np.repeat(one, 2, 0))  # known steps of the chunk take the newest places
+    np.testing.assert_allclose(extended, [*newest[2:], *one, *one])
+    np.testing.assert_allclose(follower.history(), newest)
+    assert follower_of().history().shape == (0, DOFS)
+    np.testing.assert_allclose(follower_of().history(one), one)

@@ -11,8 +11,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
+from kerv_cli.engine.acceptance import ROOT, TokenTree
 from kerv_cli.engine.draft import HOST, Draft
-from kerv_cli.engine.tree import ROOT, TokenTree
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early.drafter import choose

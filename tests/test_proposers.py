@@ -1,6 +1,6 @@
 """Every proposer, in-prefill draft and boundary is lossless under strict acceptance; HeiSD's choice and skip."""
 
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from loaded import datastore_of
 from test_decoding_lossless import assert_adds_up, plain_greedy, random_prompt, random_target
 
-from kerv_cli.engine.chunk import ActionHistory, Chunk, Situation
+from kerv_cli.engine.chunk import Chunk, Follower
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import Proposer
@@ -65,13 +65,16 @@ def stored(target: CompactTarget, prompt: torch.Tensor, chunks: np.ndarray, left
     return datastore_of(vectors, chunks, {"t": slice(0, len(chunks))}, left=left)
 
 
-def situation(random: np.random.Generator, executed: int) -> Situation:
-    history = ActionHistory(D)
-    path = [np.zeros(3)]
+F = TypeVar("F", bound=Follower)
+
+
+def after(follower: F, random: np.random.Generator, executed: int) -> F:
+    """The follower after some random actions of an episode."""
+    follower.reset("t", 0, np.zeros(3))
     for _ in range(executed):
-        history.append(random.uniform(-1, 1, D))
-        path.append(path[-1] + 0.01 * random.standard_normal(3))
-    return Situation("t", history, path)
+        action = follower.space.unnormalise(random.uniform(-1, 1, D))
+        follower.observe(action, follower.path[-1] + 0.01 * random.standard_normal(3))
+    return follower
 
 
 def proposers(target: CompactTarget, prompt: torch.Tensor, truth: list[int], seed: int) -> dict[str, Any]:
@@ -112,7 +115,7 @@ def test_every_proposer_is_lossless(name, seed, chunk, data):
     boundary = Random(RandomBoundarySettings()) if after is known["hybrid"] else None
     steps = data.draw(st.integers(0, chunk), "steps decoded, 0: all")
     decoder = Decoder(target, Parts(prefill_draft=before, proposer=after, boundary=boundary), chunk=steps)
-    decoder.situation = situation(np.random.default_rng(seed), data.draw(st.integers(0, 12), "executed"))
+    after(decoder, np.random.default_rng(seed), data.draw(st.integers(0, 12), "executed"))
     for _ in range(2):  # the second decode finds the parts as the first left them
         result = decoder.decode_prompt(prompt)
         assert result.tokens == truth[: (steps or chunk) * D]
@@ -121,12 +124,12 @@ def test_every_proposer_is_lossless(name, seed, chunk, data):
 
 
 def test_a_prediction_counts_committed_steps_as_executed():
-    chunk = Chunk(4, SPACE, situation(np.random.default_rng(0), 5), None)  # type: ignore[arg-type]
+    chunk = Chunk(4, SPACE, after(Follower(SPACE), np.random.default_rng(0), 5), None)  # type: ignore[arg-type]
     chunk.tokens = [10, 20, 30, 254, 40]
     proposer = PredictionProposer(Hold(HELD, minimum=1, horizon=4))
     assert proposer.chains(chunk, 7) == [[20, 30, 254, 10, 20, 30, 254]]
     chunk.tokens = []
-    last = SPACE.bins_of(chunk.situation.history.values()[-1]).tolist()
+    last = SPACE.bins_of(chunk.episode.history()[-1]).tolist()
     assert proposer.chains(chunk, 15) == [(last * 4)[:15]]
 
 
@@ -165,8 +168,7 @@ def skipping(left: int = 50, **changes: Any) -> tuple[Decoder, torch.Tensor, lis
     retrieval = retrieval_of(store, target, 1, 16)
     skip = VerifySkip(SimilaritySkipSettings(**changes), retrieval, (0.4, 0.5, 0.9))
     decoder = Decoder(target, Parts(proposer=retrieval, skip=skip))
-    decoder.situation = situation(np.random.default_rng(0), 3)
-    return decoder, prompt, tokens
+    return after(decoder, np.random.default_rng(0), 3), prompt, tokens
 
 
 def test_a_similar_enough_chunk_is_executed_without_a_forward():
@@ -213,7 +215,7 @@ def test_nothing_is_skipped_on_the_drafters_side():
         boundary = Random(RandomBoundarySettings(p=p))
         parts = Parts(proposer=HybridProposer(drafting, retrieval), boundary=boundary, skip=decoder.parts.skip)  # type: ignore[arg-type]
         hybrid = Decoder(decoder.target, parts)
-        hybrid.situation = decoder.situation
+        after(hybrid, np.random.default_rng(0), 3)
         assert (hybrid.decode_prompt(prompt).forwards > 0) == forwards
 
 

@@ -13,7 +13,7 @@ from command import refusal, told
 from studies_synthetic import episode, still_episode, swept, threshold_study
 from test_board import client_of
 
-from kerv_cli.engine.cost import Profile, prices, work_of_record
+from kerv_cli.episodes.cost import Profile, prices, work_of_record
 from kerv_cli.episodes.rows import decode_records
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import Study
@@ -220,7 +220,7 @@ def test_what_is_not_there_is_refused(results):
 
 def test_shipped_profiles_can_price_what_ships(tmp_path):
     from kerv_cli.base.paths import shipped_dir
-    from kerv_cli.engine.cost import FORWARDS, read_profile, source_costs
+    from kerv_cli.episodes.cost import FORWARDS, read_profile, source_costs
 
     shipped = sorted((shipped_dir().parent / "bench").glob("*.json"))
     for path in shipped:

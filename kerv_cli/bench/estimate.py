@@ -14,7 +14,7 @@ import numpy as np
 from kerv_cli.base.errors import UsageError
 from kerv_cli.bench.physics import DEVICES, ENGINES, INSTRUCTION, SHAPES, Shape, encoder_of_weights, priced, vla_shape
 from kerv_cli.bench.settings import EstimateSettings
-from kerv_cli.engine.cost import Profile
+from kerv_cli.episodes.cost import Profile
 from kerv_cli.report.profiles import NamedProfile, open_profiles
 from kerv_cli.targets.openvla.config import TOWERS, Language
 

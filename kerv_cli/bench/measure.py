@@ -27,15 +27,14 @@ from kerv_cli.base.registry import ProposerPart
 from kerv_cli.bench.model import Model, blank
 from kerv_cli.bench.physics import Sizes
 from kerv_cli.bench.settings import BenchSettings
+from kerv_cli.engine.acceptance import ROOT
 from kerv_cli.engine.chunk import Chunk
-from kerv_cli.engine.cost import FORWARDS, Profile
-from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.decoder import Decoder, Parts, Stopwatch
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.record import Round
-from kerv_cli.engine.stopwatch import Stopwatch
-from kerv_cli.engine.tree import ROOT
+from kerv_cli.episodes.cost import FORWARDS, Profile
 from kerv_cli.episodes.policy import decoder_for
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer

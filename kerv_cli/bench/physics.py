@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from kerv_cli.targets.openvla.config import TOWERS, Language, Tower
 
 if TYPE_CHECKING:
-    from kerv_cli.engine.cost import Profile
+    from kerv_cli.episodes.cost import Profile
 
 _HALF = 2.0  # bytes of a bfloat16 number
 _TREE_WIDTH = 8  # nodes per level of the drafter's tree
@@ -270,7 +270,7 @@ class Shape:
 
 def priced(shape: Shape, device: Device, engine: Engine) -> Profile:
     """Return a latency profile with the computed seconds of each phase, for chunks of up to `CHUNK` tokens."""
-    from kerv_cli.engine.cost import Profile
+    from kerv_cli.episodes.cost import Profile
 
     rows = {
         "encode": (1,),

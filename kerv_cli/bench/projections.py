@@ -8,7 +8,7 @@ from typing import Any
 
 from kerv_cli.bench.physics import DEVICES, ENGINES, ROOFLINE, SHAPES, Device, Engine, priced
 from kerv_cli.bench.settings import BenchSettings
-from kerv_cli.engine.cost import Profile
+from kerv_cli.episodes.cost import Profile
 
 ACTION = 7
 """Tokens of one action of OpenVLA. Published times are of one action."""

@@ -41,55 +41,26 @@ def chunk_steps(chunk: int, trained: int) -> int:
     return chunk or trained
 
 
-class ActionHistory:
-    """The last `window` executed actions, normalised to [−1, 1] and not rounded to tokens."""
+class Follower:
+    """Follows one episode at a time. The caller reports the start, every executed action and the end.
 
-    def __init__(self, dofs: int, window: int = WINDOW) -> None:
-        self.window, self._actions = window, np.zeros((0, dofs))
-
-    def append(self, action: np.ndarray) -> None:
-        """Add an executed action (D,), normalised to [−1, 1]."""
-        self._actions = np.concatenate([self._actions, action[None]])[-self.window :]
-
-    def values(self, pending: np.ndarray | None = None) -> np.ndarray:
-        """Return the latest m actions (m, D), oldest first. m is at most `window`.
-
-        Args:
-            pending: Actions (k, D) of the current chunk that are decided but not executed yet. They count as executed,
-                so that a prediction continues after them. None if there are none.
-        """
-        if pending is None or not len(pending):
-            return self._actions
-        return np.concatenate([self._actions, pending])[-self.window :]
-
-
-@dataclass(frozen=True)
-class Situation:
-    """What the parts of a method know about the running episode.
+    A decoder is a follower that decodes. A batch has a follower for each of its episodes.
 
     Attributes:
-        task: Name of the task.
-        history: The last executed actions.
+        space: The action space.
+        cameras: Names of the cameras whose images the decoder reads.
+        task: Name of the running episode's task.
         path: Measured positions of the end effector, (3,) each, metres, oldest first.
         last: Tokens of the chunk that was decoded last.
     """
 
-    task: str
-    history: ActionHistory
-    path: list[np.ndarray] = field(default_factory=list)
-    last: list[int] = field(default_factory=list)
-
-
-class Follower:
-    """Follows one episode at a time. The caller reports the start, every executed action and the end.
-
-    Attributes:
-        situation: The running episode so far.
-    """
-
-    def __init__(self, space: ActionSpace, cameras: tuple[str, ...]) -> None:
+    def __init__(self, space: ActionSpace, cameras: tuple[str, ...] = ()) -> None:
         self.space, self.cameras = space, cameras
-        self.situation = Situation("", ActionHistory(space.dofs))
+        self._start("", [])
+
+    def _start(self, task: str, path: list[np.ndarray]) -> None:
+        self.task, self.path, self.last = task, path, list[int]()
+        self._executed = np.zeros((0, self.space.dofs))
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
         """Start a new episode.
@@ -99,17 +70,27 @@ class Follower:
             seed: Seed of the episode, for parts that draw random numbers.
             end_effector: Initial position (3,), metres.
         """
-        self.situation = Situation(task, ActionHistory(self.space.dofs), [np.asarray(end_effector)])
+        self._start(task, [np.asarray(end_effector)])
+
+    def decode(self, observation: Observation) -> DecodeRecord:
+        """Return a record with the actions to execute. The observation must have the images of `cameras`."""
+        raise NotImplementedError
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
-        """Store an action that was executed.
+        """Store an action (D,) that was executed, environment units, and the position (3,) after it, metres."""
+        self._executed = np.concatenate([self._executed, self.space.normalise(action)[None]])[-WINDOW:]
+        self.path.append(np.asarray(end_effector))
+
+    def history(self, pending: np.ndarray | None = None) -> np.ndarray:
+        """Return the last executed actions (m, D), oldest first, normalised and not rounded to tokens; m ≤ WINDOW.
 
         Args:
-            action: (D,), environment units.
-            end_effector: Position (3,) after the action, metres.
+            pending: Actions (k, D) of the current chunk that are decided but not executed yet. They count as executed,
+                so that a prediction continues after them. None if there are none.
         """
-        self.situation.history.append(self.space.normalise(action))
-        self.situation.path.append(np.asarray(end_effector))
+        if pending is None or not len(pending):
+            return self._executed
+        return np.concatenate([self._executed, pending])[-WINDOW:]
 
     def finish(self, success: bool) -> None:
         """End the episode. `success` says whether the task was solved."""
@@ -176,12 +157,11 @@ class Chunk:
     Attributes:
         steps: H, number of control steps.
         space: The action space.
-        situation: What is known about the running episode, such as the last executed actions.
+        episode: The running episode so far, such as the last executed actions.
         target: What the target holds for this chunk, such as its cache.
         limits: Largest accepted distance of each DoF, in bins. Early drafters choose the tokens that are most likely to
             be accepted within these distances.
         choice: What the method's boundary decided about this chunk. None if the method has no boundary.
-        observation: The observation from which the chunk is decoded. None if the decoder got only a prompt.
         tokens: The committed tokens.
         rounds: Records of the rounds so far.
         rejection: Tokens of the draft and of the target after the draft token that the last round rejected, see
@@ -196,11 +176,10 @@ class Chunk:
 
     steps: int
     space: ActionSpace
-    situation: Situation
+    episode: Follower
     target: TargetSide
     limits: tuple[int, ...] = ()
     choice: Choice | None = None
-    observation: Observation | None = None
     tokens: list[int] = field(default_factory=list)
     rounds: list[Round] = field(default_factory=list)
     rejection: Rejection = Rejection()

@@ -1,14 +1,16 @@
 """The decode loop of all methods: propose, verify, accept, commit, rectify (docs/methods.md §2).
 
-Shapes: P prompt tokens, E width of the target's embeddings and hidden states.
+Shapes: B prompts, P prompt tokens, N tokens of a chunk, E width of the target's embeddings and hidden states.
 """
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Callable
+import functools
+import itertools
+import math
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -16,16 +18,61 @@ import torch
 from torch import Tensor
 
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.acceptance import Accepted, DistanceRule, StrictRule
+from kerv_cli.engine.acceptance import Accepted, DistanceRule, StrictRule, TokenTree
 from kerv_cli.engine.chunk import Chunk, Follower, Rejection, TargetSide, chunk_steps, deviation
-from kerv_cli.engine.draft import EMPTY, Draft
+from kerv_cli.engine.draft import EMPTY, Draft, read, upload
 from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold
 from kerv_cli.engine.proposer import Proposer
-from kerv_cli.engine.protocol import ContinuesGreedily, PredictsTokens, Target
-from kerv_cli.engine.record import MEAN, DecodeRecord, Round, variability
-from kerv_cli.engine.stopwatch import Stopwatch
-from kerv_cli.engine.transfer import read, upload
-from kerv_cli.engine.tree import TokenTree
+from kerv_cli.engine.protocol import Cache, ContinuesGreedily, EncodesMany, PredictsTokens, Target
+from kerv_cli.engine.record import PHASES, UNTIMED, DecodeRecord, Round, variability
+
+
+class Stopwatch:
+    """Measures the seconds that each phase of one decode takes (`PHASES`).
+
+    On CUDA the stopwatch records events in the stream and reads them at the end. So measuring does not slow the decode.
+    The CPU waits for the GPU only at the start and at the end.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.phases = dict.fromkeys(PHASES, 0.0)
+        self.events: list[tuple[str, torch.cuda.Event]] | None = None
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+            self.events = [("", self._event())]
+        self.began = self.last = time.perf_counter()
+
+    def lap(self, phase: str) -> None:
+        """Add the time since the last lap to `phase`, one of `PHASES`. On CUDA, this time is added by `stop`."""
+        if self.events is not None:
+            self.events.append((phase, self._event()))
+            return
+        now = time.perf_counter()
+        self.phases[phase] += now - self.last
+        self.last = now
+
+    def stop(self) -> float:
+        """Stop and return the seconds since the start. The time since the last lap counts as phase `other`."""
+        self.lap("other")
+        if self.events is not None:
+            torch.cuda.synchronize()
+            self.last = time.perf_counter()
+            for (_, begin), (phase, end) in itertools.pairwise(self.events):
+                self.phases[phase] += begin.elapsed_time(end) / 1000.0
+            self.phases["other"] += max(0.0, self.last - self.began - sum(self.phases.values()))
+        return self.last - self.began
+
+    @staticmethod
+    def _event() -> torch.cuda.Event:
+        event = torch.cuda.Event(enable_timing=True)
+        event.record()
+        return event
+
+
+def _event() -> torch.cuda.Event:
+    event = torch.cuda.Event(enable_timing=True)
+    event.record()
+    return event
 
 
 @dataclass(frozen=True)
@@ -65,15 +112,7 @@ class Verified(NamedTuple):
     levels: int
 
 
-class ActionDecoder(Follower):
-    """Decodes actions from observations, and follows the running episode."""
-
-    @abstractmethod
-    def decode(self, observation: Observation) -> DecodeRecord:
-        """Return a record with the actions to execute. The observation must have the images of `cameras`."""
-
-
-class Decoder(ActionDecoder):
+class Decoder(Follower):
     """Decodes chunks of actions with one target and one method, one episode at a time."""
 
     def __init__(self, target: Target, parts: Parts | None = None, chunk: int = 0) -> None:
@@ -100,7 +139,7 @@ class Decoder(ActionDecoder):
         self.decodes = 0  # in this episode
         self.deviation_every = 0  # every this many decodes, measure the deviation from autoregressive actions; 0: never
 
-    @cached_property
+    @functools.cached_property
     def autoregressive(self) -> Decoder:
         """An autoregressive decoder of the same target. Its actions are compared with the method's."""
         return Decoder(self.target, chunk=self.steps)
@@ -144,12 +183,10 @@ class Decoder(ActionDecoder):
             stopwatch.lap("vision")
             return prompt
 
-        chunk = self.decode_prompt(encode, stopwatch, observation)
+        chunk = self.decode_prompt(encode, stopwatch)
         actions = chunk.actions()
-        self.situation.last[:] = chunk.tokens
-        # a plugin's threshold need not have the attribute `measure`
-        measure = getattr(self.threshold, "measure", MEAN)
-        self.threshold.update(variability(chunk.rounds, self.space, measure))
+        self.last = chunk.tokens
+        self.threshold.update(variability(chunk.rounds, self.space, self.threshold.measure))
         if self.parts.rectifier is not None:
             self.parts.rectifier.next_decode()
         record = chunk.record(actions, stopwatch.stop(), stopwatch.phases, self.parts.similarity(chunk))
@@ -160,25 +197,19 @@ class Decoder(ActionDecoder):
         return replace(record, deviation=deviation(self.space, actions, autoregressive))
 
     @torch.inference_mode()
-    def decode_prompt(
-        self,
-        prompt: Tensor | Callable[[], Tensor],
-        stopwatch: Stopwatch | None = None,
-        observation: Observation | None = None,
-    ) -> Chunk:
+    def decode_prompt(self, prompt: Tensor | Callable[[], Tensor], stopwatch: Stopwatch | None = None) -> Chunk:
         """Decode the chunk for one prompt.
 
         Args:
             prompt: The prompt's embeddings (1, P, E), or a function that computes them when they are first needed.
             stopwatch: Measures the phases. If None, a new stopwatch is made.
-            observation: The observation. Needed only by drafters that read images or states themselves.
 
         Returns:
             The finished chunk. It has N committed tokens, or fewer if an end token or a rectifier's prediction ended
             the chunk early.
         """
         stopwatch = stopwatch or Stopwatch(self.target.device)
-        chunk, skip = self._new_chunk(prompt, observation), self.parts.skip
+        chunk, skip = self._new_chunk(prompt), self.parts.skip
         stopwatch.lap("propose")
         if skip is not None:
             chunk.take(skip.take(chunk))
@@ -190,13 +221,13 @@ class Decoder(ActionDecoder):
             (self.round if self.parts.proposer else self.decode_plainly)(chunk, stopwatch)
         return chunk
 
-    def _new_chunk(self, prompt: Tensor | Callable[[], Tensor], observation: Observation | None) -> Chunk:
+    def _new_chunk(self, prompt: Tensor | Callable[[], Tensor]) -> Chunk:
         self.cache.length, choice, boundary = 0, None, self.parts.boundary
         if boundary is not None:
-            choice = boundary.choose(np.array(self.situation.path))
+            choice = boundary.choose(np.array(self.path))
         limits = self.acceptance.limits(self.threshold.radius())
         target = TargetSide(prompt if callable(prompt) else lambda: prompt, self.cache)
-        return Chunk(self.steps, self.space, self.situation, target, limits, choice, observation)
+        return Chunk(self.steps, self.space, self, target, limits, choice)
 
     def round(self, chunk: Chunk, stopwatch: Stopwatch) -> None:
         """Run one round: propose, verify, accept, commit, rectify.
@@ -386,3 +417,99 @@ class Decoder(ActionDecoder):
             hidden = torch.cat([hidden, self.commit(chunk, self.verify(chunk, EMPTY), Accepted((), None), None)], 1)
             stopwatch.lap("verify")
         return hidden
+
+
+class BatchDecoder:
+    """Decodes one chunk for each of several episodes, with the target and the method of a decoder.
+
+    In float32 it decodes the same tokens as `Decoder`, unless two logits are equal up to rounding. The records have no
+    times.
+    """
+
+    def __init__(self, decoder: Decoder) -> None:
+        """Use the target and the method of `decoder`. `Method.check` tests whether the method can be batched."""
+        self.decoder, self.target = decoder, decoder.target
+        self.limits = decoder.acceptance.limits(decoder.threshold.radius())
+        self.skip, self.size = decoder.parts.skip, decoder.target.actions.longest(decoder.steps)
+        self._caches: dict[int, Cache] = {}
+
+    def new_episode(self) -> Follower:
+        """Return a `Follower` for one more episode of the batch."""
+        return Follower(self.target.actions, self.target.cameras)
+
+    @torch.inference_mode()
+    def decode(self, episodes: Sequence[Follower], observations: Sequence[Observation]) -> list[DecodeRecord]:
+        """Decode one observation per episode. Return one record per episode, with the actions to execute."""
+        prompts = functools.cache(lambda: self._encode(observations))  # encoded only if some part reads a prompt
+        steps, space, cache = self.decoder.steps, self.target.actions, self.decoder.cache
+        chunks = []
+        for i, episode in enumerate(episodes):
+            target = TargetSide(lambda i=i: prompts()[i], cache)  # type: ignore[misc]
+            chunk = Chunk(steps, space, episode, target, self.limits)
+            if self.skip is not None:
+                cache.length = 0
+                chunk.take(self.skip.take(chunk))
+            chunks.append(chunk)
+        groups: dict[int, list[Chunk]] = {}  # chunks with equally long prompts are decoded together, unpadded
+        for chunk in chunks:
+            if chunk.remaining:
+                groups.setdefault(chunk.target.prompt_length, []).append(chunk)
+        for group in groups.values():
+            prompt = torch.cat([chunk.target.prompt for chunk in group])
+            decoded, _ = greedy(self.target, prompt, self._cache(len(group)), self.size)
+            for chunk, tokens in zip(group, decoded.tolist(), strict=True):
+                for token in chunk.until_end(tokens):
+                    chunk.commit_token(token)
+        for chunk in chunks:
+            chunk.episode.last = chunk.tokens
+        similarity = self.decoder.parts.similarity
+        return [chunk.record(chunk.actions(), math.nan, dict(UNTIMED), similarity(chunk)) for chunk in chunks]
+
+    def _encode(self, observations: Sequence[Observation]) -> list[Tensor]:
+        """Return each prompt's embeddings (1, P, E).
+
+        On a CPU the observations are encoded one by one, because kerv's compiled encoders are faster that way.
+        """
+        if isinstance(self.target, EncodesMany) and self.target.device.type != "cpu":
+            return list(self.target.encode_many(observations).split(1))
+        return list(map(self.target.encode, observations))
+
+    def _cache(self, rows: int) -> Cache:
+        """Return an empty cache for `rows` sequences.
+
+        The last cache is used again if it has this number of sequences. Otherwise a new cache replaces it. The number
+        of sequences often changes, and keeping a cache for each number would fill the memory.
+        """
+        if rows not in self._caches:
+            self._caches = {rows: self.target.new_cache(rows, self.target.max_prompt + self.size)}
+        self._caches[rows].length = 0
+        return self._caches[rows]
+
+
+@torch.inference_mode()
+def greedy(target: Target, prompt: Tensor, cache: Cache | None = None, size: int = 0) -> tuple[Tensor, Tensor]:
+    """Decode a batch of prompts autoregressively.
+
+    Args:
+        target: The policy.
+        prompt: The prompts' embeddings (B, P, E).
+        cache: An empty cache with room for P + N tokens. If None, a new cache is made.
+        size: N, number of tokens to decode. If 0, the largest number that a chunk of the target can have.
+
+    Returns:
+        Two tensors. The decoded tokens (B, N), which after an end token are all end tokens. The hidden states
+        (B, P + N − 1, E) of the prompt and of all decoded tokens but the last.
+    """
+    length, size = prompt.shape[1], size or target.actions.longest(target.chunk)
+    cache = cache or target.new_cache(len(prompt), length + size)
+    positions = torch.arange(length + size - 1, device=prompt.device)
+    hidden = [target.forward(prompt, positions[:length], cache)]
+    tokens = [target.head(hidden[0][:, -1]).argmax(-1)]
+    for position in positions[length:].split(1):
+        hidden.append(target.forward(target.embed(tokens[-1][:, None]), position, cache))
+        tokens.append(target.head(hidden[-1][:, -1]).argmax(-1))
+    found, end = torch.stack(tokens, 1), target.actions.end
+    if end is not None:
+        is_end = (found == end).long()
+        found = found.masked_fill(is_end.cumsum(1) > is_end, end)
+    return found, torch.cat(hidden, 1)

@@ -46,7 +46,12 @@ class Threshold(Buildable):
     """Chooses the acceptance radius r of every decode (docs/methods.md §3.2).
 
     r is the largest accepted distance, in bins, between a draft token and the target's token.
+
+    Attributes:
+        measure: How the variability K is computed that `update` gets: one of `MEASURES` (`record.py`).
     """
+
+    measure = "mean of compared"
 
     def reset(self) -> None:
         """Start a new episode."""

@@ -146,39 +146,24 @@ class DecodeRecord:
         return None
 
 
-@dataclass(frozen=True)
-class Measure:
-    """How the kinematic variability K of a decode is computed (docs/methods.md §3.2).
-
-    Attributes:
-        accepted: True if only accepted draft tokens count. False if the rejected token after them counts, too.
-        total: True if K is the sum of the differences, False if it is their mean.
-    """
-
-    accepted: bool = False
-    total: bool = False
-
-    @property
-    def name(self) -> str:
-        """Name of the measure in a calibration, such as `mean of compared`."""
-        return f"{'sum' if self.total else 'mean'} of {'accepted' if self.accepted else 'compared'}"
-
-
-MEAN = Measure()
+MEAN = "mean of compared"
 """The measure by which `DecodeRecord.variability` is computed."""
-MEASURES = MEAN, Measure(total=True), Measure(accepted=True), Measure(accepted=True, total=True)
+MEASURES = MEAN, "sum of compared", "mean of accepted", "sum of accepted"
+"""The ways to compute the kinematic variability K of a decode (docs/methods.md §3.2).
+
+`accepted`: only accepted draft tokens count. `compared`: the rejected token after them counts, too.
+"""
 
 
-def variability(rounds: Sequence[Round], space: ActionSpace, measure: Measure = MEAN) -> float | None:
+def variability(rounds: Sequence[Round], space: ActionSpace, measure: str = MEAN) -> float | None:
     """Return the kinematic variability K: how far a decode's drafts were from the target's tokens.
 
-    Strict DoFs (those that must equal the target's token, such as a gripper) are left out, because one wrong gripper
-    token would outweigh all other differences.
+    Strict DoFs, such as a gripper, are left out, because one wrong gripper token would outweigh all other differences.
 
     Args:
         rounds: The rounds of the decode.
         space: The action space.
-        measure: Which tokens count, and whether their differences are added or averaged.
+        measure: One of MEASURES.
 
     Returns:
         K in normalised action units. None if no draft token counts, or if tokens have no distance.
@@ -187,14 +172,14 @@ def variability(rounds: Sequence[Round], space: ActionSpace, measure: Measure = 
         return None
     differences: list[float] = []
     for one in rounds:
-        count = one.accepted if measure.accepted else len(one.drafted)
+        count = one.accepted if measure.endswith("accepted") else len(one.drafted)
         if count and one.mode != "skip":
             drafted, targets = space.values_of(np.array((one.drafted[:count], one.target_tokens[:count])))
             moving = ~space.strict_tokens(one.start + count)[one.start :]
             differences += np.abs(drafted - targets)[moving].tolist()
     if not differences:
         return None
-    return float(np.sum(differences) if measure.total else np.mean(differences))
+    return float(np.sum(differences) if measure.startswith("sum") else np.mean(differences))
 
 
 def path_length(points: np.ndarray) -> float:

@@ -14,7 +14,6 @@ import numpy as np
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.chunk import Follower
-from kerv_cli.engine.decoder import ActionDecoder
 from kerv_cli.engine.record import DecodeRecord, Delay, EpisodeRecord
 from kerv_cli.episodes.settings import CHUNK
 from kerv_cli.worlds.settings import CameraSettings
@@ -151,7 +150,7 @@ class _Execution:
 
 def run_episode(
     world: World,
-    decoder: ActionDecoder,
+    decoder: Follower,
     seed: int,
     camera: CameraSettings | None = None,
     clock: RealClock | None = None,

@@ -14,10 +14,10 @@ from kerv_cli.base.paths import results_dir
 from kerv_cli.base.registry import DRAFTING
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.spaces import Observation, ObservationSpace
-from kerv_cli.engine.cost import Profile, prices, read_profile, work_of_record
-from kerv_cli.engine.decoder import ActionDecoder, Decoder
+from kerv_cli.engine.chunk import Follower
+from kerv_cli.engine.decoder import Decoder, Stopwatch
 from kerv_cli.engine.record import DecodeRecord
-from kerv_cli.engine.stopwatch import Stopwatch
+from kerv_cli.episodes.cost import Profile, prices, read_profile, work_of_record
 from kerv_cli.episodes.episode import Latency, RealClock, steps_during
 from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.episodes.settings import CHUNK, MEASURED, PROFILE, REAL, WAITS, RolloutSettings
@@ -149,7 +149,7 @@ def _check_clock(settings: RolloutSettings, spec: EnvironmentSpec, target: Targe
     return {}
 
 
-def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
+def decoder_for(settings: RolloutSettings, task: str) -> Follower:
     """Return the decoder for one setting (a method with all its options) on one task, warmed up.
 
     Raises:
@@ -158,7 +158,7 @@ def decoder_for(settings: RolloutSettings, task: str) -> ActionDecoder:
     """
     spec = spec_of(task)
     expert = settings.policy.kind == EXPERT
-    decoder: ActionDecoder = ExpertDecoder(task) if expert else method_decoder(settings, task)
+    decoder: Follower = ExpertDecoder(task) if expert else method_decoder(settings, task)
     warm_up(decoder, task, spec.observation, settings.world.camera.size)
     return decoder
 
@@ -233,15 +233,13 @@ def _profile_path(settings: RolloutSettings) -> Path:
     raise UsageError(f"rollout.profile={name}: no such document, nor in {results}/bench: 'kerv bench' writes one")
 
 
-def still_observation(decoder: ActionDecoder, space: ObservationSpace, pixels: int) -> Observation:
+def still_observation(decoder: Follower, space: ObservationSpace, pixels: int) -> Observation:
     """Return an observation of zeros, with every input that the decoder reads. Images are `pixels` × `pixels`."""
     images = {name: np.zeros(frame_shape(name, pixels), dtype=np.uint8) for name in decoder.cameras}
     return Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
 
 
-def warm_up(
-    decoder: ActionDecoder, task: str, space: ObservationSpace, pixels: int, decodes: int = WARM_UP_DECODES
-) -> None:
+def warm_up(decoder: Follower, task: str, space: ObservationSpace, pixels: int, decodes: int = WARM_UP_DECODES) -> None:
     """Run a few decodes before anything is timed, because the first decodes allocate memory and choose kernels.
 
     The simulated hand moves, so that parts that need past actions or positions run, too.
@@ -260,7 +258,7 @@ def warm_up(
             decoder.observe(action, np.array([0.01 * i, 0.0, 0.1]))
 
 
-class ExpertDecoder(ActionDecoder):
+class ExpertDecoder(Follower):
     """Returns one action at a time from the environment's scripted controller of a task.
 
     The controller reads the privileged simulator state, as policies with `observation=state` do. It is no neural

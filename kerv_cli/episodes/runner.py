@@ -19,8 +19,8 @@ import numpy as np
 
 from kerv_cli.base.errors import NO_RERUN, UsageError, has_rerun
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.batched import BatchDecoder
 from kerv_cli.engine.chunk import Follower
+from kerv_cli.engine.decoder import BatchDecoder
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
 from kerv_cli.episodes.episode import episode, run_episode

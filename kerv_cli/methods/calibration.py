@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.engine.record import MEAN, Measure
+from kerv_cli.engine.record import MEAN
 from kerv_cli.methods.artifacts import Artifact, MadeFor, Use, check_sources
 from kerv_cli.methods.heisd import FusedBoundarySettings
 from kerv_cli.methods.heisd.curvature import BoundaryRanges
@@ -43,7 +43,7 @@ class Variability:
     Attributes:
         k_s: Reference level K_S: the median K over the decodes that were measured, in normalised action units.
         decodes: Number of decodes that were measured.
-        levels: Median of K for each way to compute K, by the name of the `Measure`. The median for `MEAN` is `k_s`.
+        levels: Median of K for each way to compute K, by its name in `MEASURES`. The median for `MEAN` is `k_s`.
             Empty in calibrations before version 1.1.
     """
 
@@ -151,12 +151,12 @@ class Calibration:
         """Tasks for which the reference level K_S of the variability was measured."""
         return self.variability
 
-    def k_s(self, task: str, measure: Measure = MEAN) -> float:
+    def k_s(self, task: str, measure: str = MEAN) -> float:
         """Return the task's reference level K_S of the variability, in normalised action units.
 
         Args:
             task: Full name of the task.
-            measure: Way to compute K.
+            measure: Way to compute K, one of `MEASURES`.
 
         Raises:
             CheckpointError: K_S was not measured for this task or this measure.
@@ -167,12 +167,12 @@ class Calibration:
                 f"{', '.join(self.variability) or 'no task'}: run 'kerv calibrate task={task}'"
             )
         row = self.variability[task]
-        if measure != MEAN and measure.name not in row.levels:
+        if measure != MEAN and measure not in row.levels:
             raise CheckpointError(
-                f"the calibration has no reference level K_S for K as the {measure.name} tokens: run 'kerv calibrate "
+                f"the calibration has no reference level K_S for K as the {measure} tokens: run 'kerv calibrate "
                 "complete=true' for the policy, or name threshold.k_s"
             )
-        return row.levels.get(measure.name, row.k_s)
+        return row.levels.get(measure, row.k_s)
 
     def ranges(self, window: int) -> BoundaryRanges:
         """Return the ranges of radius of curvature and path length, for a boundary that sees `window` positions.

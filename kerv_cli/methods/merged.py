@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import MOST_TOKENS, number
 from kerv_cli.base.registry import PREFILL, ProposerPart
+from kerv_cli.engine.acceptance import merge
 from kerv_cli.engine.proposer import ChainProposer
-from kerv_cli.engine.tree import merge
 from kerv_cli.methods.heisd import RetrievalProposerSettings
 
 if TYPE_CHECKING:

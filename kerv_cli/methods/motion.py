@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import MOST_TOKENS, number
 from kerv_cli.base.registry import AcceptancePart, BoundaryPart
-from kerv_cli.engine.acceptance import Accepted, DistanceRule, nearest_child
+from kerv_cli.engine.acceptance import ROOT, Accepted, DistanceRule, TokenTree, nearest_child
 from kerv_cli.engine.decisions import Choice
 from kerv_cli.engine.parts import Boundary
-from kerv_cli.engine.tree import ROOT, TokenTree
 
 if TYPE_CHECKING:
     import numpy as np

@@ -88,7 +88,7 @@ class LookupProposer(ChainProposer):
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         """Return one chain of at most `depth` tokens. The chain is empty in an episode's first chunk."""
-        last, tokens = chunk.situation.last, chunk.tokens
+        last, tokens = chunk.episode.last, chunk.tokens
         for size in range(min(self.settings.longest, len(tokens)), 0, -1):
             places = [place for place in range(size, len(last)) if last[place - size : place] == tokens[-size:]]
             if places:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.paths import as_path, shipped_dir
-from kerv_cli.engine.cost import Profile, read_profile
+from kerv_cli.episodes.cost import Profile, read_profile
 
 _SHIPPED = "-profile.json"
 _EIGHT_MS = 0.008  # what HeiSD's encoder takes on an A100 (arXiv 2603.17573)

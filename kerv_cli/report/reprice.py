@@ -17,7 +17,7 @@ import pandas as pd
 import pyarrow.compute as pc
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.engine.cost import COUNTED, READ_PHASES, Profile, Work, prices, read_profile, work_of
+from kerv_cli.episodes.cost import COUNTED, READ_PHASES, Profile, Work, prices, read_profile, work_of
 from kerv_cli.report.measures import MICRO, Measures, Result, Row, averaged, columns_of, measure, paired, speedups
 from kerv_cli.report.profiles import NamedProfile, open_profiles
 from kerv_cli.report.tables import StudyData

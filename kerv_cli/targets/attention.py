@@ -15,8 +15,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from kerv_cli.engine.draft import upload
 from kerv_cli.engine.protocol import Seen
-from kerv_cli.engine.transfer import upload
 
 
 class Cache:

@@ -208,8 +208,8 @@ def reference_level(records: Sequence[DecodeRecord], actions: ActionSpace, chunk
         found = np.array([variability(record.rounds, actions, measure) for record in records], dtype=float)
         known = found[~np.isnan(found)]  # NaN: no draft token counts
         median = float(np.median(known)) if len(known) else 0.0
-        levels[measure.name] = max(median, bin_width if measure.total else bin_width / moving)
-    return stored.Variability(levels[MEAN.name], len(records), levels)
+        levels[measure] = max(median, bin_width if measure.total else bin_width / moving)
+    return stored.Variability(levels[MEAN], len(records), levels)
 
 
 def episode_decodes(decoder: Decoder, dataset: DemoDataset, index: int, decodes: int) -> list[DecodeRecord]:
@@ -272,7 +272,7 @@ def completed(old: stored.Calibration, new: stored.Calibration) -> stored.Calibr
     variability = dict(new.variability)
     for task, row in old.variability.items():
         measured = new.variability[task].levels if task in new.variability else {}
-        variability[task] = replace(row, levels={**measured, MEAN.name: row.k_s, **row.levels})
+        variability[task] = replace(row, levels={**measured, MEAN: row.k_s, **row.levels})
     return replace(
         old,
         noise=noise,

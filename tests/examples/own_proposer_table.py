@@ -60,7 +60,7 @@ class FollowProposer(ChainProposer):
         self.follows, self.depth = table.follows.cpu().numpy(), depth
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        history, first = chunk.situation.history.values(), len(chunk.tokens)
+        history, first = chunk.episode.history(), len(chunk.tokens)
         if not len(history):
             return []
         known = [*chunk.space.bins_of(history[-1]).tolist(), *chunk.tokens]  # the same DoF a step before lies D back

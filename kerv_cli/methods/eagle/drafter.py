@@ -23,15 +23,13 @@ from torch import Tensor, nn
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ObservationSpace
-from kerv_cli.engine.batched import greedy
+from kerv_cli.engine.acceptance import ROOT
 from kerv_cli.engine.chunk import Chunk
-from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.engine.draft import HOST, Draft
+from kerv_cli.engine.decoder import Decoder, Parts, greedy
+from kerv_cli.engine.draft import HOST, Draft, upload
 from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import JoinsDrafters, ReadableTarget, Target
-from kerv_cli.engine.transfer import upload
-from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.drafters import Decodes, DrafterDescription, Metrics, TrainableDrafter

@@ -19,11 +19,11 @@ from torch import Tensor, nn
 
 from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
-from kerv_cli.engine.batched import greedy
 from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.decoder import greedy
+from kerv_cli.engine.draft import read
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.protocol import JoinsDrafters, ReadableTarget
-from kerv_cli.engine.transfer import read
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.drafters import Decodes, Metrics, TrainableDrafter
 from kerv_cli.methods.early import EarlySettings

@@ -16,11 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 from kerv_cli.base import registry
 from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, number
-from kerv_cli.engine.acceptance import Accepted, DistanceRule, accept_by_group
+from kerv_cli.engine.acceptance import Accepted, DistanceRule, TokenTree, accept_by_group
 from kerv_cli.engine.decisions import Choice, SkipDecision
 from kerv_cli.engine.parts import Boundary, Skip
 from kerv_cli.engine.proposer import ChainProposer, Proposer
-from kerv_cli.engine.tree import TokenTree
 from kerv_cli.methods.eagle import DrafterProposerSettings, only_of_trees
 from kerv_cli.methods.spec_vla import RelaxedRule
 
@@ -128,7 +127,7 @@ class RetrievalProposer(ChainProposer):
         """Return the stored entries most similar to the chunk's observation. The search runs once per chunk."""
         if self._nearest is None or self._nearest[0] is not chunk:
             key = self.datastore.key_of(chunk.target.prompt, self.target)
-            self._nearest = chunk, self.datastore.query(key, chunk.situation.task, self.count)
+            self._nearest = chunk, self.datastore.query(key, chunk.episode.task, self.count)
         return self._nearest[1]
 
     def similarity(self, chunk: Chunk) -> float | None:

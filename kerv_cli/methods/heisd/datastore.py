@@ -31,10 +31,9 @@ from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.registry import SearchPart
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.engine.draft import Draft
+from kerv_cli.engine.acceptance import ROOT
+from kerv_cli.engine.draft import Draft, read
 from kerv_cli.engine.protocol import ReadableTarget
-from kerv_cli.engine.transfer import read
-from kerv_cli.engine.tree import ROOT
 from kerv_cli.methods.artifacts import Artifact, Artifacts
 from kerv_cli.methods.heisd import MANIFEST, Index
 from kerv_cli.targets.checkpoint import TargetDescription

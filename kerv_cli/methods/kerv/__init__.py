@@ -14,7 +14,6 @@ from kerv_cli.engine.parts import Rectifier, Threshold
 
 if TYPE_CHECKING:
     from kerv_cli.engine.chunk import Chunk
-    from kerv_cli.engine.record import Measure
     from kerv_cli.methods.context import Context
     from kerv_cli.methods.kerv.prediction import Predictor
 
@@ -224,11 +223,9 @@ class KinematicThresholdSettings(RadiusRange):
     total: bool = False  # true: K is the sum of the differences (summary); false: their mean (ours)
 
     @property
-    def measure(self) -> Measure:
-        """Way to compute the variability K, by the settings `over` and `total`."""
-        from kerv_cli.engine.record import Measure
-
-        return Measure(self.over == ACCEPTED, self.total)
+    def measure(self) -> str:
+        """Way to compute the variability K, one of `MEASURES` (`engine/record.py`)."""
+        return f"{'sum' if self.total else 'mean'} of {self.over}"
 
     def needs(self) -> tuple[str, ...]:
         """Return the kinds of artifacts needed: the calibration, if `k_s` is None."""
@@ -264,7 +261,6 @@ class Variable(Threshold):
 
     Attributes:
         r: The radius of the next decode, in bins, not rounded.
-        measure: Way to compute K.
         last: K of the last decode in which drafts were compared.
     """
 
@@ -279,7 +275,7 @@ class Variable(Threshold):
             self.k_s = settings.k_s
         else:
             self.k_s = context.calibration.k_s(context.task, self.measure)
-            if self.measure.total and context.chunk:  # a sum over fewer control steps than the calibration's
+            if settings.total and context.chunk:  # a sum over fewer control steps than the calibration's
                 self.k_s *= context.chunk / context.target.chunk
         self.reset()
 

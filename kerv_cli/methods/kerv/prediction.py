@@ -249,7 +249,7 @@ class PredictionProposer(ChainProposer):
         """Return one chain of up to `depth` predicted tokens, or no chain if the history is too short."""
         whole = len(chunk.tokens) // chunk.dofs
         pending = np.array(chunk.tokens[: whole * chunk.dofs], dtype=np.int64).reshape(whole, chunk.dofs)
-        history = chunk.situation.history.values(chunk.space.values_of(pending))
+        history = chunk.episode.history(chunk.space.values_of(pending))
         predicted = self.predictor.predict(history, chunk.steps - whole)
         if predicted is None:
             return []
@@ -285,7 +285,7 @@ def assemble(
     flat = np.full(steps * dofs, np.nan)
     flat[: len(values)] = values
     actions: np.ndarray = flat.reshape(steps, dofs)
-    history = chunk.situation.history.values(actions[:whole])
+    history = chunk.episode.history(actions[:whole])
     if len(history):  # strict DoFs keep their last value; if there is none, they take the draft's tokens
         flat[len(tokens) :][chunk.space.strict_tokens(flat.size)[len(tokens) :]] = np.nan
     if np.isnan(actions).any():

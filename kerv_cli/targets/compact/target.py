@@ -28,8 +28,8 @@ from torch import Tensor, nn
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
+from kerv_cli.engine.draft import upload
 from kerv_cli.engine.protocol import Seen
-from kerv_cli.engine.transfer import upload
 from kerv_cli.targets.attention import Cache, attention_mask
 from kerv_cli.targets.checkpoint import FLOAT32, TargetDescription, save_module, target_fields
 from kerv_cli.targets.compact import features

@@ -18,8 +18,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from kerv_cli.engine.draft import upload
 from kerv_cli.engine.protocol import Seen
-from kerv_cli.engine.transfer import upload
 from kerv_cli.targets.attention import Cache, CapturedCache, Rotation, Slots, attend, attention_mask, rotate
 from kerv_cli.targets.compact.program import Compilable, Program
 

@@ -26,8 +26,8 @@ from kerv_cli.base.manifests import read
 from kerv_cli.base.paths import artifact
 from kerv_cli.base.runtime import DTYPES, set_up
 from kerv_cli.base.spaces import Observation, ObservationSpace
+from kerv_cli.engine.draft import upload
 from kerv_cli.engine.protocol import Seen
-from kerv_cli.engine.transfer import upload
 from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.checkpoint import FORMAT, TargetDescription, load_target, target_fields
 from kerv_cli.targets.openvla.config import action_space, read_shape, read_statistics
