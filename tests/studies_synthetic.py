@@ -41,7 +41,7 @@ IDENTITY = {"target": "a" * 64, "drafter": "b" * 64}
 
 def settings_of(method: str, r: int = 0, episodes: int = 4) -> RolloutSettings:
     settings = RolloutSettings(method=method, episodes=episodes)
-    settings.world = settled(settings.world, SPEC)
+    settings.world = settled(settings.world, ["reach"])
     settings.proposer = part("proposer", "none" if method == "ar" else "drafter")
     settings.acceptance = part("acceptance", "relaxed" if r else "strict")
     settings.threshold.r = r

@@ -5,8 +5,9 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from command import kerv
+from command import kerv, refusal
 from conftest import refused
+from scipy.spatial.transform import Rotation
 
 import kerv_cli as library
 from kerv_cli.base.errors import UsageError
@@ -17,6 +18,7 @@ from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.libero import world as packages
 from kerv_cli.worlds.libero.spec import SPEC, STATES
+from kerv_cli.worlds.libero.tasks import CHANGES
 from kerv_cli.worlds.settings import CameraSettings
 
 needs_libero = pytest.mark.skipif(find_spec("libero") is None, reason="needs pip install 'kerv[libero]'")
@@ -72,6 +74,63 @@ def test_packages_that_do_not_work_together_are_named_with_a_remedy(versions, ow
 def test_evaluation_has_one_seed_for_each_initial_state_of_the_benchmark():
     with pytest.raises(UsageError):
         SPEC.seeds.check([FIRST + STATES], "evaluation", "seed")
+
+
+def test_each_suite_has_ten_tasks_and_its_own_horizon():
+    own = {"LIBERO_SPATIAL": 220, "LIBERO_OBJECT": 280, "LIBERO_GOAL": 300, "LIBERO_10": 520}
+    for suite, horizon in own.items():
+        for change in CHANGES:
+            tasks = SPEC.expand(suite + change)
+            assert (len(tasks), SPEC.control_steps(0, tasks)) == (10, horizon)
+    assert len(SPEC.tasks) == 200
+    assert SPEC.task("put-bowl-on-cabinet").instruction == "put the bowl on top of the cabinet"
+    assert SPEC.task("put-mugs-on-plates").instruction.startswith("put the white mug on the left plate and put the")
+    assert SPEC.task("turn-on-stove_task").instruction == "Turn off the stove"
+    assert SPEC.task("turn-on-stove_swap").instruction == SPEC.task("turn-on-stove").instruction
+    assert SPEC.control_steps(90, ["bowl-on-stove", "turn-on-stove"]) == 90
+
+
+def test_tasks_with_different_horizons_need_one(monkeypatch, tmp_path):
+    monkeypatch.setattr(packages, "check_packages", lambda: None)
+    monkeypatch.setattr(spec_module, "version", lambda name: "1")
+    words = ["policy=expert", "episodes=1", f"results={tmp_path}"]
+    assert "have 220 or 300 control steps: type world.horizon=N" in refusal(
+        "rollout", "task=[bowl-on-stove,turn-on-stove]", *words, code=2
+    )
+    for command in ("rollout", "demos"):
+        said = refusal(command, "task=LIBERO_GOAL", *words[command == "demos" :], code=2)
+        assert "libero has no scripted expert for open-middle-drawer, nor for 9 more of these tasks" in said
+
+
+@needs_libero
+@pytest.mark.parametrize(
+    "task", ["alphabet-soup-in-basket", "turn-on-stove", "put-mug-in-microwave", "ketchup-in-basket_object"]
+)
+def test_every_suite_begins_at_the_benchmarks_states_and_shows_both_cameras(task):
+    with SPEC.open_world(task, CameraSettings(size=32)) as world:
+        starts = [world.reset(seed) for seed in (FIRST, FIRST + 1, FIRST)]
+        np.testing.assert_array_equal(starts[0].state, starts[2].state)
+        assert not np.array_equal(starts[0].state, starts[1].state)
+        joints = world._states[0][1:8]  # after the time
+        np.testing.assert_allclose(starts[0].readings["joints"], joints, atol=0.05)
+        images = world.observe(["agentview", "robot0_eye_in_hand:75"]).images.values()
+        assert [image.shape for image in images] == [(32, 32, 3)] * 2
+        assert min(image.std() for image in images) > 10
+        shapes = {"position": 3, "quaternion": 4, "axis_angle": 3, "fingers": 2, "joints": 7}
+        assert {name: len(value) for name, value in world.step(np.zeros(7)).readings.items()} == shapes
+        turned = Rotation.from_rotvec(starts[0].readings["axis_angle"]).as_matrix()
+        np.testing.assert_allclose(turned, Rotation.from_quat(starts[0].readings["quaternion"]).as_matrix(), atol=1e-9)
+
+
+@needs_libero
+def test_turning_the_knob_solves_the_task():
+    with SPEC.open_world("turn-on-stove") as world:
+        world.reset(FIRST)
+        assert not world.success
+        knob = world._model.joint("flat_stove_1_button").qposadr[0]
+        world._data.qpos[knob] = 1.0
+        world.step(SPEC.standstill(1.0))
+        assert world.success
 
 
 @needs_libero

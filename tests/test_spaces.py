@@ -149,7 +149,8 @@ def test_every_spec_fits_together():
     for spec in specs().values():
         assert all(name in spec.tasks for suite in spec.suites.values() for name in suite)
         assert set(spec.upside_down) <= set(spec.cameras)
-        assert len({task.instruction for task in spec.tasks.values()}) == len(spec.tasks)
+        own = [task.instruction for name, task in spec.tasks.items() if "_" not in name]  # LIBERO-PRO repeats some
+        assert len(set(own)) == len(own)
         assert spec.observation.state >= len(spec.observation.proprioception) > 3
 
 

@@ -345,12 +345,15 @@ class Observation:
         state: (s,) float64, the simulator's privileged state.
         instruction: The task in words.
         images: Images (h, w, 3) uint8, by camera. Only cameras that the policy reads are included.
+        readings: The robot's own measurements by name, such as `position` (3,), for policies behind a server. Empty if
+            the environment names none.
     """
 
     proprioception: np.ndarray
     state: np.ndarray
     instruction: str = ""
     images: Mapping[str, np.ndarray] = field(default_factory=dict)
+    readings: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def with_images(self, images: Mapping[str, np.ndarray]) -> Observation:
         """Return a copy of the observation with these images instead."""

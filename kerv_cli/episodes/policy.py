@@ -59,6 +59,7 @@ def check(settings: RolloutSettings) -> dict[str, str]:
     _check_seeds(settings, spec)
     spec.check_stress(settings.world.stress)
     if settings.policy.kind == EXPERT:
+        spec.check_experts(tasks)
         _check_expert(settings)
         _check_clock(settings, spec, None)
         experts = ";".join(f"{task} {spec.experts[task]}" for task in sorted(tasks) if task in spec.experts)
@@ -134,7 +135,7 @@ def _check_clock(settings: RolloutSettings, spec: EnvironmentSpec, target: Targe
         _profile_latency(settings, target)
         return {"profile": sha256_of(_profile_path(settings))}
     late = steps_during(timing.latency_ms / 1000.0, spec.actions.control_hz)
-    horizon = spec.control_steps(settings.world.horizon)
+    horizon = spec.control_steps(settings.world.horizon, resolve_tasks(settings.task))
     if late >= horizon:
         raise UsageError(
             f"rollout.latency_ms={timing.latency_ms:g}: {late} control steps, but an episode of {spec.name} has "

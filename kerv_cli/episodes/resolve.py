@@ -18,7 +18,7 @@ from kerv_cli.base.registry import METHOD_KINDS
 from kerv_cli.episodes.identity import flat, without_effect
 from kerv_cli.episodes.settings import DEFAULT_TASKS, RolloutSettings, StudySettings, SweepSettings
 from kerv_cli.methods.settings import EXPERT
-from kerv_cli.worlds import resolve_tasks, settled, spec_of
+from kerv_cli.worlds import resolve_tasks, settled
 
 MOST_SEEDS = 10_000
 """Number of seeds in a block of a rollout. It is so large that all seeds of a task usually form one block."""
@@ -246,7 +246,7 @@ def _settle(settings: Iterable[RolloutSettings], baseline: RolloutSettings, narr
     narrowed = [task for task in tasks if task in trained] or trained
     for setting in settings:
         setting.task = narrowed or setting.task or tasks
-        setting.world = settled(setting.world, spec_of(resolve_tasks(setting.task)[0]))
+        setting.world = settled(setting.world, resolve_tasks(setting.task))
 
 
 def _is_ar(settings: RolloutSettings) -> bool:

@@ -82,7 +82,7 @@ def train_target(settings: TrainTargetSettings, database: Database, begin: Begin
     tasks = resolve_tasks(settings.task)
     settle_places(settings, dataset)
     spec = spec_of(tasks[0])
-    world = settled(settings.world, spec)
+    world = settled(settings.world, tasks)
     init = initial_target(settings, world.camera.name, folder)
     check_spaces(dataset, spec.actions, spec.observation, f"the tasks' environment {spec.name}")
     check_tasks(dataset, tasks)

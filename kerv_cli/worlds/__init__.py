@@ -26,11 +26,15 @@ class Task:
         name: Full name. No other environment has a task with this name.
         instruction: Sentence that the policy reads.
         difficulty: Name of the task's group. Tables of results also show averages over each group.
+        horizon: Control steps of an episode. 0 stands for the environment's.
+        expert: Whether the environment's scripted experts solve it.
     """
 
     name: str
     instruction: str
     difficulty: str
+    horizon: int = 0
+    expert: bool = True
 
 
 W = TypeVar("W", bound="WorldSettings")
@@ -130,19 +134,11 @@ def task_names() -> Iterator[str]:
             yield from (*spec.suites, *spec.tasks)
 
 
-def settled(world: W, spec: EnvironmentSpec) -> W:
-    """Return a world's settings. The environment's defaults replace an empty camera name and a horizon of 0.
-
-    Args:
-        world: Settings of the world.
-        spec: The environment.
-
-    Raises:
-        UnknownName: The environment has no such camera.
-        UsageError: The horizon is longer than the simulator can run, or a view has an impossible field of view.
-    """
+def settled(world: W, tasks: Sequence[str]) -> W:
+    """Return a world's settings for tasks, whose defaults replace an empty camera name and a horizon of 0."""
+    spec = spec_of(tasks[0])
     camera = replace(world.camera, name=spec.camera_name(world.camera.name))
-    return replace(world, camera=camera, horizon=spec.control_steps(world.horizon))
+    return replace(world, camera=camera, horizon=spec.control_steps(world.horizon, tasks))
 
 
 def _metaworld_names() -> tuple[str, ...]:

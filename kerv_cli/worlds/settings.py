@@ -31,7 +31,7 @@ class WorldSettings:
     """Settings of the simulated world of an episode."""
 
     camera: CameraSettings = setting(CameraSettings, "the policy's view")
-    horizon: int = number(0, 0, 1_000_000, help="control steps of an episode; 0: the environment's own")
+    horizon: int = number(0, 0, 1_000_000, help="control steps of an episode; 0: the task's own")
 
 
 @dataclass

@@ -83,7 +83,7 @@ class EnvironmentSpec:
             proprioception.
         tasks: The tasks by full name.
         suites: The full names of each suite's tasks, by the suite's name in capitals.
-        horizon: Default number of control steps of an episode, which is also the largest.
+        horizon: Largest number of control steps of an episode. It is the default of tasks that name none.
         cameras: Names of the cameras. The first is the default.
         world_class: `module:class` of the `World`. Empty for a recorded dataset, in which nothing can be executed.
         expert_class: `module:class`, called with (spec, task) to make an `Expert`. Empty if there are no experts.
@@ -167,18 +167,25 @@ class EnvironmentSpec:
         check_settings(settings, "camera")
         return replace(settings, name=self.camera_name(settings.name))
 
-    def control_steps(self, horizon: int) -> int:
+    def control_steps(self, horizon: int, tasks: Iterable[str] = ()) -> int:
         """Return the number of control steps of an episode.
 
         Args:
-            horizon: The number to check. 0 stands for the environment's default.
+            horizon: The number to check. 0 stands for the default of the tasks.
+            tasks: Full or short names. None stand for the environment.
 
         Raises:
-            UsageError: The simulator cannot run that many control steps.
+            UsageError: The simulator cannot run that many control steps, or the tasks have different defaults.
         """
         if not 0 <= horizon <= self.horizon:
             raise UsageError(f"horizon={horizon}: {self.name} runs 1 to {self.horizon} control steps")
-        return horizon or self.horizon
+        found = sorted({self.task(name).horizon or self.horizon for name in tasks}) or [self.horizon]
+        if not horizon and len(found) > 1:
+            raise UsageError(
+                f"episodes of these tasks have {' or '.join(map(str, found))} control steps: type world.horizon=N, or "
+                "run them one after the other, -m task=A,B"
+            )
+        return horizon or found[0]
 
     def check_stress(self, settings: StressSettings) -> None:
         """Refuse a kind of stress that is impossible in this environment.
@@ -241,7 +248,7 @@ class EnvironmentSpec:
         Args:
             task: Full or short name.
             camera: Default view of `World.frame`. If None, the environment's first camera.
-            horizon: Control steps of an episode. 0 stands for the environment's default.
+            horizon: Control steps of an episode. 0 stands for the task's default.
 
         Raises:
             UnknownName: There is no such task or camera.
@@ -251,15 +258,25 @@ class EnvironmentSpec:
         self.check_installed()
         return load(self.world_class)(self, task, camera, horizon)
 
+    def check_experts(self, tasks: Iterable[str]) -> None:
+        """Raise UsageError if a task has no scripted expert."""
+        if not self.expert_class:
+            raise UsageError(f"{self.name} has no scripted experts: record demonstrations with its own tools")
+        alone = [name for name in tasks if not self.task(name).expert]
+        if alone:
+            others = f", nor for {len(alone) - 1} more of these tasks" * (len(alone) > 1)
+            raise UsageError(
+                f"{self.name} has no scripted expert for {alone[0]}{others}: name a policy, policy.target="
+            )
+
     def expert(self, task: str) -> Expert:
         """Return the scripted expert of a task.
 
         Raises:
             UnknownName: There is no such task.
-            UsageError: The environment has no experts.
+            UsageError: There is no expert.
         """
-        if not self.expert_class:
-            raise UsageError(f"{self.name} has no scripted experts: record demonstrations with its own tools")
+        self.check_experts([task])
         return load(self.expert_class)(self, task)
 
 
@@ -302,7 +319,7 @@ class World(ABC):
         """
         entry = spec.task(task)
         self.spec, self.task, self.instruction = spec, entry.name, entry.instruction
-        self.camera, self.horizon = spec.camera(camera), spec.control_steps(horizon)
+        self.camera, self.horizon = spec.camera(camera), spec.control_steps(horizon, [entry.name])
         self.steps, self.success, self.succeeded = 0, False, False
         self.stress: Stress = NO_STRESS
         self._observation: Observation | None = None
@@ -326,6 +343,10 @@ class World(ABC):
     @abstractmethod
     def _draw(self, camera: CameraSettings) -> NDArray[np.uint8]:
         """Return the image (size, size, 3) of one camera as uint8 RGB, upright."""
+
+    def _readings(self) -> Mapping[str, NDArray[np.float64]]:
+        """Return the robot's own measurements by name, for `Observation.readings`."""
+        return {}
 
     @property
     @abstractmethod
@@ -411,7 +432,7 @@ class World(ABC):
 
     def _observe_state(self, state: NDArray[np.float64]) -> Observation:
         proprioception = state[: len(self.spec.observation.proprioception)]
-        self._observation = Observation(proprioception, state, self.instruction)
+        self._observation = Observation(proprioception, state, self.instruction, readings=self._readings())
         return self._observation
 
     def frame(self, camera: CameraSettings | None = None) -> NDArray[np.uint8]:

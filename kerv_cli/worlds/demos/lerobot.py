@@ -456,7 +456,7 @@ def _task_names(tasks: Mapping[int, str], world: EnvironmentSpec | None) -> dict
         UsageError: The environment has no task with this instruction.
     """
     if world:
-        known = {task.instruction: task.name for task in world.tasks.values()}
+        known = {task.instruction: task.name for task in reversed([*world.tasks.values()])}  # the first of equals
         for text in tasks.values():
             if text not in known:
                 raise UsageError(f"environment={world.name}: it has no task with the instruction '{text}'")

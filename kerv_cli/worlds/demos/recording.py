@@ -79,7 +79,8 @@ class DemoConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "tasks", resolve_tasks(self.tasks))
         object.__setattr__(self, "camera", self.spec.camera(self.camera))
-        object.__setattr__(self, "horizon", self.spec.control_steps(self.horizon))
+        object.__setattr__(self, "horizon", self.spec.control_steps(self.horizon, self.tasks))
+        self.spec.check_experts(self.tasks)
         check_settings(self, "demonstrations")
         ends = self.first_seed, self.first_seed + self.episodes - 1
         self.spec.seeds.check(ends, "training", "demonstrations")

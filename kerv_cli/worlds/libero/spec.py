@@ -1,10 +1,9 @@
-"""The constants of LIBERO's suite `libero_spatial`: ten tasks of a Panda arm with seven degrees of freedom."""
+"""The constants of LIBERO: a Panda arm with seven degrees of freedom."""
 
 from __future__ import annotations
 
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, Place
-from kerv_cli.worlds import Task
-from kerv_cli.worlds.libero.tasks import INSTRUCTIONS, SUITE
+from kerv_cli.worlds.libero.tasks import HORIZONS, SUITES, TASKS
 from kerv_cli.worlds.spec import EnvironmentSpec, Seeds
 
 EXPERTS = "kerv 1"
@@ -28,17 +27,17 @@ SPEC = EnvironmentSpec(
         high=(1.0,) * 7,
     ),
     observation=ObservationSpace(
-        # hand [0:7], with its rotation away from pointing straight down; object [7:10], goal [10:13]; hand and object
-        # one control step earlier [13:23]
+        # hand [0:7], with its rotation away from pointing straight down; first [7:10] and last [10:13] object or
+        # region of interest; hand and first object one control step earlier [13:23]
         proprioception=("x", "y", "z", "roll", "pitch", "yaw", "gripper"),
         state=23,
         places=(Place("object", 7), Place("goal", 10)),
         centre=(0.0, 0.0, 1.0),
         previous=(10, 13),
     ),
-    tasks={name: Task(name, text, "spatial") for name, text in INSTRUCTIONS.items()},
-    suites={SUITE: tuple(INSTRUCTIONS)},
-    horizon=220,  # as in OpenVLA's evaluation
+    tasks=TASKS,
+    suites=SUITES,
+    horizon=max(HORIZONS.values()),
     cameras=("agentview", "robot0_eye_in_hand", "frontview", "sideview"),
     world_class="kerv_cli.worlds.libero.world:Libero",
     expert_class="kerv_cli.worlds.libero.world:LiberoExpert",
@@ -46,5 +45,5 @@ SPEC = EnvironmentSpec(
     extra="libero",
     grip=(1.0, -1.0),
     seeds=Seeds(evaluation=range(_FIRST, _FIRST + STATES)),
-    experts=dict.fromkeys(INSTRUCTIONS, EXPERTS),
+    experts={name: EXPERTS for name, task in TASKS.items() if task.expert},
 )

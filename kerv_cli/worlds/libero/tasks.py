@@ -1,26 +1,39 @@
-"""The tasks of LIBERO's suite `libero_spatial` and their instructions."""
+"""The tasks of LIBERO's four suites of ten, and of the versions that LIBERO-PRO changed.
+
+`tasks.csv` has a row per task: its file in the benchmark, from whose name the instruction is made, and the instructions
+of the versions `task` (another goal) and `lan` (other words).
+"""
 
 from __future__ import annotations
 
-_WHERE = (
-    "between the plate and the ramekin",
-    "next to the ramekin",
-    "from table center",
-    "on the cookie box",
-    "in the top drawer of the wooden cabinet",
-    "on the ramekin",
-    "next to the cookie box",
-    "on the stove",
-    "next to the plate",
-    "on the wooden cabinet",
-)
-INSTRUCTIONS: dict[str, str] = {}
-"""Instruction of each task, by the task's name."""
+import csv
+import re
+from pathlib import Path
 
-for _place in _WHERE:
-    _name = _place.replace(" the", "").replace("the ", "").replace(" ", "-")
-    INSTRUCTIONS[f"bowl-{_name}"] = f"pick up the black bowl {_place} and place it on the plate"
+from kerv_cli.worlds import Task
 
-SUITE = "LIBERO_SPATIAL"
-NAMES = (SUITE, *INSTRUCTIONS)
-"""Names of the suite and its tasks, for shell completion."""
+HORIZONS = {"spatial": 220, "object": 280, "goal": 300, "10": 520}
+"""Control steps of an episode in each suite, as in OpenVLA's and openpi's evaluation."""
+CHANGES = ("", "_swap", "_object", "_task", "_lan")
+"""Endings of suites and tasks: the benchmark's own, then LIBERO-PRO's: other places, other looks, another goal, other
+words."""
+
+TASKS: dict[str, Task] = {}
+FILES: dict[str, tuple[str, str]] = {}
+"""Folder and name of a task's files in the benchmark, without their endings."""
+SUITES: dict[str, tuple[str, ...]] = {}
+
+with Path(__file__).with_name("tasks.csv").open(encoding="utf-8") as _file:
+    _rows = list(csv.DictReader(_file))
+
+for _change in CHANGES:
+    for _row in _rows:
+        _name, _group = _row["name"] + _change, _row["suite"] + _change
+        _said = re.sub(r"^[A-Z_]+_SCENE\d+_", "", _row["file"]).replace("_", " ")
+        _said = _row.get(_change[1:]) or _said
+        TASKS[_name] = Task(_name, _said, _group, HORIZONS[_row["suite"]], _group == "spatial")
+        FILES[_name] = f"libero_{_group}", _row["file"]
+        SUITES[f"LIBERO_{_group}".upper()] = (*SUITES.get(f"LIBERO_{_group}".upper(), ()), _name)
+
+NAMES = (*SUITES, *TASKS)
+"""Names of suites and tasks, for shell completion."""

