@@ -11,7 +11,8 @@ from mock_target import SEVEN, MockTarget
 
 from kerv_cli.base.registry import find
 from kerv_cli.base.spaces import ActionSpace, Group
-from kerv_cli.engine.acceptance import ROOT, DistanceRule, TokenTree, accept_by_group, merge
+from kerv_cli.engine.acceptance import DistanceRule, accept_by_group
+from kerv_cli.engine.decisions import ROOT, TokenTree, merge
 from kerv_cli.engine.draft import Draft, ancestors_of, ancestors_on_device
 from kerv_cli.methods.context import Context
 from kerv_cli.targets.attention import Cache, attention_mask

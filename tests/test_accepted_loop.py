@@ -16,8 +16,8 @@ from test_acceptance import space_of
 from test_decoding_lossless import assert_adds_up, random_prompt, random_target
 
 from kerv_cli.base.spaces import ActionSpace, Observation
-from kerv_cli.engine.acceptance import ROOT, TokenTree
 from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.decisions import ROOT, TokenTree
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.parts import Fixed

@@ -58,6 +58,8 @@ def test_early_and_retrieved_drafts_have_costs_and_others_take_what_was_recorded
     assert jacobi.needs == ["encode", "prefill", "verify"]
     merged = work(("verify", 0, 30, 2, "merged"), ("verify", 3, 12, 12, "jacobi"))
     assert merged.needs == ["encode", "prefill", "verify", "early"]
+    without = work(("verify", 0, 30, 2, "hold+lookup"))  # takes what was recorded
+    assert (without.needs, without.propose.tolist()) == (["encode", "prefill"], [0.5])
     beside = work(("verify", 0, 15, 2, "early"), ("verify", 3, 12, 12, "drafter"), looked_up=True)
     assert beside.needs == ["encode", "prefill", "verify", "feed", "draft", "early", "retrieval"]
 

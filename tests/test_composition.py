@@ -108,7 +108,6 @@ def test_settings_survive_a_file(method):
         ("rectifier=compensate_draft rectifier.use_target_token=false", "leave rectifier.use_target_token=true"),
         ("skip=always", "skip=always with prefill_draft=none: it executes a draft from before the prefill"),
         ("method=spec_vla proposer.depth=0", "proposer.depth=0"),
-        ("skip=speed skip.v_min=2 skip.v_max=1", "skip.v_min=2 skip.v_max=1"),
         ("method=spec_vla threshold.r=255", "threshold.r=255: bins from 0 to 254"),
         ("method=kerv threshold.r_max=255", "threshold.r_max=255: bins from 0 to 254"),
         ("method=kerv threshold=schedule threshold.r_max=255", "threshold.r_max=255: bins from 0 to 254"),

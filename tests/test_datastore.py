@@ -20,7 +20,7 @@ from test_calibration import write_dataset
 
 from kerv_cli.base.errors import CheckpointError, StorageError, UnknownName, UsageError
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.acceptance import ROOT, TokenTree
+from kerv_cli.engine.decisions import ROOT, TokenTree
 from kerv_cli.lab.database import Database
 from kerv_cli.methods.heisd.datastore import Datastore, Shard, check_seeds, neighbour_tree, prompt_key
 from kerv_cli.methods.settings import PolicySettings

@@ -14,8 +14,8 @@ from test_acceptance import space_of
 from kerv_cli.base.codes import FastCode
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.spaces import ActionSpace, Observation
-from kerv_cli.engine.acceptance import ROOT
 from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.decisions import ROOT
 from kerv_cli.engine.decoder import BatchDecoder, Decoder, Parts
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import Proposer

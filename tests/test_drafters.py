@@ -12,7 +12,7 @@ from test_decoding_lossless import random_prompt, random_target
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.engine.acceptance import ROOT, TokenTree
+from kerv_cli.engine.decisions import ROOT, TokenTree
 from kerv_cli.methods.artifacts import MadeFor
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter

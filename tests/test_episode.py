@@ -256,6 +256,19 @@ def decode_of(rounds: Sequence[Round], propose: float = 0.0) -> DecodeRecord:
 AR = decode_of([Round("decode" if i else "prefill", "none", i, (), (i,), 0, 1, 0, ()) for i in range(16)])
 
 
+def test_only_executed_actions_count_as_unverified():
+    """Of chunks of four steps: one whole and skipped, one late by a step and compensated, one that the end cut."""
+    zeros = np.zeros((4, 4), np.float32)
+    skip = decode_of([Round("skip", "early", 0, (0,) * 16, (), 16, 16, 0, ())])
+    skipped = dataclasses.replace(skip, skipped=True)
+    late = dataclasses.replace(AR, compensated=6, filled=(2, 3, 4, 5, 14, 15), delay=Delay(0.01, 1, 4, dropped=1))
+    record = EpisodeRecord("metaworld", METAWORLD.actions, "t", "go", 0, True, 9, (skipped, late, skipped), (0, 5, 7),
+                           np.zeros((9, 4), np.float32), np.zeros((10, 3), np.float32), zeros[0], zeros[0])  # fmt: skip
+    assert record.executed == [(0, 4), (1, 3), (0, 2)]
+    row = episode_row(record)
+    assert (row["executed_tokens"], row["unverified_tokens"]) == (32, 16 + 2 + 8)
+
+
 def test_a_profile_prices_the_records_forwards():
     """All on another device but acceptance and the like, whose seconds are the record's own."""
     assert profiled(PROFILE)(AR) == pytest.approx(0.005 + 0.008 + 15 * 0.002 + 0.001)

@@ -10,7 +10,7 @@ from kerv_cli.base.codes import FastCode
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import BoundaryPart, part_of
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.acceptance import TokenTree
+from kerv_cli.engine.decisions import TokenTree
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.context import Context
@@ -45,7 +45,6 @@ def chosen(**names: str) -> Method:
         {"proposer": "kalman"},
         {"prefill_draft": "hold"},
         {"skip": "streak", "prefill_draft": "early"},
-        {"skip": "speed"},
     ],
 )
 def test_parts_that_need_a_distance_are_refused_in_one_line(parts):

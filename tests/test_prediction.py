@@ -1,6 +1,7 @@
 """Kinematic predictors against references, and the accepted prefix that they complete (docs/methods.md §3.1)."""
 
 import functools
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,8 @@ from kerv_cli.engine.chunk import WINDOW, Chunk, Follower
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import Proposer
-from kerv_cli.methods.kerv import CompensateSettings, Compensation
+from kerv_cli.methods.context import Context
+from kerv_cli.methods.kerv import CompensateSettings, Compensation, find_predictor
 from kerv_cli.methods.kerv.prediction import (
     HORIZON,
     PREDICTORS,
@@ -350,3 +352,12 @@ def test_the_history_keeps_the_newest():
     np.testing.assert_allclose(follower.history(), newest)
     assert follower_of().history().shape == (0, DOFS)
     np.testing.assert_allclose(follower_of().history(one), one)
+
+
+@pytest.mark.parametrize(("kind", "least"), [("hold", 1), ("linear", 2), ("kalman", 4), ("walk", 4)])
+def test_a_predictor_of_a_method_asks_for_as_many_actions_as_the_page_says(kind, least):
+    calibrated = SimpleNamespace(noise=NOISE, window=WINDOW)
+    target = SimpleNamespace(actions=SPACE, chunk=4)
+    built = find_predictor(kind).predictor(Context(target, lambda kind: calibrated))
+    assert built.predict(np.zeros((least - 1, D)), 1) is None
+    assert built.predict(np.zeros((least, D)), 1) is not None

@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
-from kerv_cli.engine.acceptance import ROOT, TokenTree
+from kerv_cli.engine.decisions import ROOT, TokenTree
 from kerv_cli.engine.draft import HOST, Draft
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter

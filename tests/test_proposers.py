@@ -1,5 +1,6 @@
 """Every proposer, in-prefill draft and boundary is lossless under strict acceptance; HeiSD's choice and skip."""
 
+from types import SimpleNamespace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -31,6 +32,7 @@ from kerv_cli.methods.heisd import (
 from kerv_cli.methods.heisd.datastore import Datastore, prompt_key
 from kerv_cli.methods.kerv.prediction import Hold, Kalman, Linear, Noise, PredictionProposer
 from kerv_cli.methods.merged import MergedProposer
+from kerv_cli.methods.reuse import JacobiProposer, JacobiProposerSettings
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -149,12 +151,25 @@ def test_merging_drops_what_is_named_last_and_cuts_the_last_branch():
     assert MergedProposer([one, two], 8).propose(chunk, 3).tree.tokens == (1, 2, 3, 5, 6, 9, 9, 9)
     assert MergedProposer([one, two], 7).propose(chunk, 3).tree.tokens == (1, 2, 3, 5, 6)
     assert MergedProposer([two, one], 2).propose(chunk, 3).tree.tokens == (9, 9)
-    assert (MergedProposer([one, two], 8).name, MergedProposer([two], 8).name) == ("merged", "two")
+    assert (MergedProposer([one, two], 8).name, MergedProposer([two], 8).name) == ("one+two", "two")
     careful = MergedProposer([two], 8, fallback=[one])
-    assert careful.name == "merged"
+    assert careful.name == "two+one"
+    early = Fixed("early", [])
+    assert (MergedProposer([early, two], 8).name, MergedProposer([early], 8).name) == ("merged", "early")
     assert careful.propose(chunk, 3).tree.tokens == (9, 9, 9, 1, 2, 3, 5, 6)
     two.sure = True
     assert careful.propose(chunk, 3).tree.tokens == (9, 9, 9)
+
+
+def test_jacobis_guesses_stay_at_their_places_where_a_rectifier_filled_some():
+    proposer = JacobiProposer(JacobiProposerSettings(depth=2))
+    proposer.guess = list(range(1, 10))  # of the places 1 … 9, each the number of its place
+    chunk: Any = SimpleNamespace(tokens=[0] * 6)  # two guesses were judged, a rectifier filled up to place 5
+    proposer.committed(chunk, 0, torch.empty(0), [101, 102, 103])
+    assert proposer.guess == [6, 7, 8, 9]
+    proposer.guess, chunk.tokens = list(range(1, 10)), [0] * 2  # the first guess was rejected
+    proposer.committed(chunk, 0, torch.empty(0), [101, 102, 103])
+    assert proposer.guess == [102, 103, *range(4, 10)]
 
 
 # --- HeiSD: choice and skip

@@ -315,3 +315,17 @@ def test_another_sources_accepted_chain_does_not_count():
     record = decoder.decode(SHOWN)
     assert record.forwards == 1  # the right one was accepted whole
     assert modes(decoder, 2) == "vv"
+
+
+@torch.inference_mode()
+def test_the_first_source_is_compared_on_its_own_path_where_another_path_wins():
+    """Both are rejected at their first token. The other one is nearer, so its path is recorded."""
+    target = ByPlace()
+    truth = np.array(near(target).drafted)
+    strict = target.actions.strict_tokens(len(truth))
+    first, other = near(target, 2), near(target, 1)
+    for source in (first, other):
+        source.drafted = np.where(strict, truth, source.drafted).tolist()
+    assert modes(decoder_of(first, target, MergedProposer([first, other], nodes=64)), 2) == "vs"
+    first.drafted = np.where(strict, truth, near(target, 12).drafted).tolist()
+    assert modes(decoder_of(first, target, MergedProposer([first, other], nodes=64)), 2) == "vv"

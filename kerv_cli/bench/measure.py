@@ -27,8 +27,8 @@ from kerv_cli.base.registry import ProposerPart
 from kerv_cli.bench.model import Model, blank
 from kerv_cli.bench.physics import Sizes
 from kerv_cli.bench.settings import BenchSettings
-from kerv_cli.engine.acceptance import ROOT
 from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.decisions import ROOT
 from kerv_cli.engine.decoder import Decoder, Parts, Stopwatch
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.parts import Fixed

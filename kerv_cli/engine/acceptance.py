@@ -1,10 +1,7 @@
-"""Drafts as trees, and the rules that accept their tokens (docs/methods.md §2). Imports neither torch nor numpy.
+"""Acceptance rules: which draft tokens are good enough (docs/methods.md §2.1). Imports neither torch nor numpy.
 
-Node i of a tree has a token, a parent and a depth. Parent −1 is the last committed token. Depth 0 is the first drafted
-position. Parents come before their children. After c committed tokens, a node at depth d is token c + d of the chunk.
-
-A path leads from the last committed token down the tree. The longest accepted path wins. Ties go to the path with the
-smaller summed distance to the target tokens, then to the path that was proposed first.
+A path leads from the last committed token down a draft's tree. The longest accepted path wins. Ties go to the path with
+the smaller summed distance to the target tokens, then to the path that was proposed first.
 """
 
 from __future__ import annotations
@@ -15,90 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from kerv_cli.engine.decisions import ROOT, TokenTree
 from kerv_cli.engine.parts import Buildable
 
 if TYPE_CHECKING:
     from kerv_cli.base.spaces import ActionSpace
-
-
-ROOT = -1
-
-
-@dataclass(frozen=True)
-class TokenTree:
-    """A draft as a tree of n nodes, on the CPU.
-
-    Attributes:
-        tokens: Token of each node.
-        parents: Index of each node's parent, smaller than the node's index; −1 is the last committed token.
-        depths: Depth of each node; 0 is the first drafted position.
-    """
-
-    tokens: tuple[int, ...]
-    parents: tuple[int, ...]
-    depths: tuple[int, ...]
-
-    @classmethod
-    def build(cls, tokens: Sequence[int], parents: Sequence[int] | None = None) -> TokenTree:
-        """Build a tree, and compute the depths.
-
-        Args:
-            tokens: Token of each node.
-            parents: Index of each node's parent, −1 for the last committed token. None builds a chain.
-
-        Raises:
-            ValueError: A parent does not come before its child.
-        """
-        n = len(tokens)
-        if parents is None:
-            return cls(tuple(tokens), tuple(range(ROOT, n - 1)), tuple(range(n)))
-        depths: list[int] = []
-        for i, parent in enumerate(parents):
-            if not ROOT <= parent < i:
-                raise ValueError(f"node {i} has parent {parent}: parents come before their children")
-            depths.append(0 if parent == ROOT else depths[parent] + 1)
-        return cls(tuple(tokens), tuple(parents), tuple(depths))
-
-    def __len__(self) -> int:
-        return len(self.tokens)
-
-    @property
-    def levels(self) -> int:
-        """Number of nodes on the longest path. 0 for a chain, which has no branches."""
-        depth = max(self.depths, default=-1) + 1
-        return depth if depth < len(self) else 0
-
-    def down_from(self, node: int) -> list[int]:
-        """Return the path from `node` down to a leaf, `node` first. At each node the path goes to the first child."""
-        nodes = [node]
-        for i in range(node + 1, len(self)):
-            if self.parents[i] == nodes[-1]:
-                nodes.append(i)
-        return nodes
-
-    def path_to(self, node: int) -> list[int]:
-        """Return the nodes from depth 0 down to `node`, `node` included. Empty if `node` is −1, the root."""
-        path: list[int] = []
-        while node != ROOT:
-            path.append(node)
-            node = self.parents[node]
-        return path[::-1]
-
-
-def merge(chains: Sequence[Sequence[int]]) -> TokenTree:
-    """Merge several token sequences into one prefix tree. Sequences share the nodes of a common beginning."""
-    tokens: list[int] = []
-    parents: list[int] = []
-    children: dict[tuple[int, int], int] = {}
-    for chain in chains:
-        node = ROOT
-        for token in map(int, chain):
-            if (node, token) not in children:
-                children[node, token] = len(tokens)
-                tokens.append(token)
-                parents.append(node)
-            node = children[node, token]
-    return TokenTree.build(tokens, parents)
 
 
 class Accepted(NamedTuple):

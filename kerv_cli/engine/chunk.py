@@ -15,7 +15,7 @@ import numpy as np
 
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation
-from kerv_cli.engine.decisions import Choice, Rectified, SkipDecision
+from kerv_cli.engine.decisions import ROOT, Choice, Rectified, SkipDecision, TokenTree
 from kerv_cli.engine.record import PARALLEL, DecodeRecord, Round, variability
 
 if TYPE_CHECKING:
@@ -166,6 +166,8 @@ class Chunk:
         rounds: Records of the rounds so far.
         rejection: Tokens of the draft and of the target after the draft token that the last round rejected, see
             `Rejection`. Empty if the last round rejected no token.
+        verified_in_prefill: The draft that the prefill verified, and the target's prediction after the last committed
+            token and after each node. Empty if it verified none.
         forwards: Number of forwards of the target so far.
         reason: The skip rule's reason to skip or to verify. None if there is no reason.
         closed: If a rectifier ended the chunk early: the normalised actions (S, D) of its S ≤ H control steps.
@@ -183,6 +185,7 @@ class Chunk:
     tokens: list[int] = field(default_factory=list)
     rounds: list[Round] = field(default_factory=list)
     rejection: Rejection = Rejection()
+    verified_in_prefill: tuple[TokenTree, Sequence[int]] = TokenTree((), (), ()), ()
     forwards: int = 0
     reason: str | None = None
     closed: np.ndarray | None = None
@@ -235,24 +238,24 @@ class Chunk:
         return float(np.abs(self.space.values_of(first) - self.space.values_of(second)).mean())
 
     def targets_along(self, chain: Sequence[int]) -> list[int] | None:
-        """Return the target's predictions along a chain that the first round verified.
-
-        Call this before the second round, which discards the predictions after a rejected token.
+        """Return the target's predictions along a chain of the draft that the prefill verified.
 
         Args:
-            chain: Draft of the whole chunk, N tokens.
+            chain: Draft of the whole chunk, N tokens. It need not be the path that was accepted.
 
         Returns:
-            The target's token at each verified position, N − 1 or N tokens. None if the first round did not verify this
-            chain, or verified fewer than N − 1 tokens of it.
+            The target's token at each verified position, N − 1 or N tokens. None if the prefill verified fewer than
+            N − 1 tokens of this chain.
         """
-        if not self.rounds:
-            return None
-        verification, rejection = self.rounds[-1], self.rejection
-        path = [*verification.drafted, *rejection.draft]
-        if verification.start or len(path) < self.size - 1 or path != list(chain[: len(path)]):
-            return None
-        return [*verification.target_tokens[: len(verification.drafted)], *rejection.target[: len(rejection.draft)]]
+        tree, target_tokens = self.verified_in_prefill
+        nodes = {pair: node for node, pair in enumerate(zip(tree.parents, tree.tokens, strict=True))}
+        node, targets = ROOT, list[int]()
+        for token in chain:
+            if (node, token) not in nodes:
+                break
+            targets.append(target_tokens[node + 1])
+            node = nodes[node, token]
+        return targets if len(targets) >= self.size - 1 else None
 
     def commit(self, record: Round, tokens: Sequence[int], rejection: Rejection | None = None) -> None:
         """Commit the tokens that one forward of the target decided.

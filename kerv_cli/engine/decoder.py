@@ -18,8 +18,9 @@ import torch
 from torch import Tensor
 
 from kerv_cli.base.spaces import Observation
-from kerv_cli.engine.acceptance import Accepted, DistanceRule, StrictRule, TokenTree
+from kerv_cli.engine.acceptance import Accepted, DistanceRule, StrictRule
 from kerv_cli.engine.chunk import Chunk, Follower, Rejection, TargetSide, chunk_steps, deviation
+from kerv_cli.engine.decisions import TokenTree
 from kerv_cli.engine.draft import EMPTY, Draft, read, upload
 from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold
 from kerv_cli.engine.proposer import Proposer
@@ -350,6 +351,8 @@ class Decoder(Follower):
             chunk.commit_token(target_tokens[0])
             return self._keep(chunk, verified, [])
         start, nodes = len(chunk.tokens), path if rejected is None else (*path, rejected)
+        if not start:
+            chunk.verified_in_prefill = tree, target_tokens
         after_rejection = [] if rejected is None else tree.down_from(rejected)
         is_full = start + len(path) == chunk.size or (bool(path) and tree.tokens[path[-1]] == self.space.end)
         bonus = [] if is_full else [target_tokens[path[-1] + 1 if path else 0]]

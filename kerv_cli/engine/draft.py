@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from kerv_cli.base.errors import KervError
-from kerv_cli.engine.acceptance import ROOT, TokenTree
 from kerv_cli.engine.chunk import check_tokens
+from kerv_cli.engine.decisions import ROOT, TokenTree
 
 HOST = torch.device("cpu")
 

@@ -122,12 +122,20 @@ class DecodeRecord:
 
     @property
     def unverified(self) -> int:
-        """Number of executed action values that the target did not verify.
+        """Number of action values that the target did not verify, of all steps × D values of `actions`."""
+        return self.unverified_among(0, len(self.actions))
 
-        In a skipped or parallel decode these are all steps × D values of `actions`. In any other decode they are the
-        values that a rectifier predicted.
+    def unverified_among(self, first: int, end: int) -> int:
+        """Return the number of unverified values among the control steps first … end − 1 of `actions`.
+
+        In a skipped or parallel decode these are all values. In any other decode they are the predicted values.
         """
-        return int(self.actions.size) if self.skipped or self.mode == PARALLEL else self.compensated
+        values = self.actions.size // max(1, len(self.actions))
+        among = range(first * values, end * values)
+        if self.skipped or self.mode == PARALLEL:
+            return len(among)
+        predicted = self.filled or range(self.actions.size - self.compensated, self.actions.size)
+        return sum(place in among for place in predicted)
 
     @property
     def verifications(self) -> int:
@@ -219,6 +227,15 @@ class EpisodeRecord:
     def timed(self) -> bool:
         """Whether the decodes have times. They have none if several episodes were decoded at once."""
         return not math.isnan(self.seconds)
+
+    @property
+    def executed(self) -> list[tuple[int, int]]:
+        """For each decode, the range of its actions that were executed: the first one, and the one after the last."""
+        found, begins = [], [*self.decode_steps[1:], self.steps]
+        for decode, step, following in zip(self.decodes, self.decode_steps, begins, strict=True):
+            first = decode.delay.dropped if decode.delay else 0
+            found.append((first, min(len(decode.actions), first + following - step)))
+        return found
 
     @property
     def forwards(self) -> int:

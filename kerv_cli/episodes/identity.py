@@ -26,9 +26,11 @@ from kerv_cli.episodes.settings import CONSTANT, PROFILE, WAITS, RolloutSettings
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.settings import EXPERT
 
-ENGINE = 1
+ENGINE = 2
 """Version of the decoding. Increase it with every change of the code that alters tokens or actions.
-tests/test_golden.py checks this."""
+tests/test_golden.py checks this.
+
+2: a streak compares the first source's draft on its own path, and the filter of KERV's code waits for four actions."""
 
 Plain = Mapping[str, Any]
 """A rollout's settings as nested dictionaries, lists and plain values, as they are stored."""

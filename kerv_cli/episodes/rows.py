@@ -54,6 +54,15 @@ def _looks_up(one: Round) -> bool:
     return part is not None and part.looks_up
 
 
+def _executed(episode: EpisodeRecord, count: Callable[[DecodeRecord, int, int], int]) -> int:
+    """Sum `count` over the control steps of each chunk that were executed."""
+    return sum(count(one, *steps) for one, steps in zip(episode.decodes, episode.executed, strict=True))
+
+
+def _values(decode: DecodeRecord, first: int, end: int) -> int:
+    return (end - first) * decode.actions.shape[1]
+
+
 _EPISODE: Fields = {
     **_columns("success", kind=FLAG),
     **_columns("steps"),  # control steps executed
@@ -70,8 +79,8 @@ _EPISODE: Fields = {
     "compensated_tokens": (INT, _summed(lambda decode: decode.compensated)),
     "compensated_decodes": (INT, _summed(lambda decode: decode.compensated > 0)),
     "skipped_decodes": (INT, _summed(lambda decode: decode.skipped)),
-    "unverified_tokens": (INT, _summed(lambda decode: decode.unverified)),  # executed but not verified by the target
-    "executed_tokens": (INT, _summed(lambda decode: int(decode.actions.size))),  # control steps × DoFs returned
+    "unverified_tokens": (INT, lambda episode: _executed(episode, DecodeRecord.unverified_among)),
+    "executed_tokens": (INT, lambda episode: _executed(episode, _values)),  # control steps × DoFs
     "retrieval_decodes": (INT, _summed(lambda decode: any(map(_looks_up, decode.rounds)))),
     "deviation_sum": (FLOAT, _summed(lambda decode: decode.deviation)),  # normalised action units, over sampled decodes
     "deviation_count": (INT, _summed(lambda decode: decode.deviation is not None)),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import MOST_TOKENS, number
 from kerv_cli.base.registry import PREFILL, ProposerPart
-from kerv_cli.engine.acceptance import merge
+from kerv_cli.engine.decisions import merge
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.methods.heisd import RetrievalProposerSettings
 
@@ -73,7 +73,9 @@ class MergedProposer(ChainProposer):
 
     def __init__(self, sources: Sequence[ChainProposer], nodes: int, fallback: Sequence[ChainProposer] = ()) -> None:
         together = [*sources, *fallback]
-        self.name = together[0].name if len(together) == 1 else "merged"
+        names = [source.name for source in together]
+        # records, and so prices, tell a merge with the early drafter's network from one without it
+        self.name = "merged" if len(names) > 1 and "early" in names else "+".join(names)
         self.sources, self.fallback, self.nodes = sources, fallback, nodes
 
     @classmethod

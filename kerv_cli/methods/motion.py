@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import MOST_TOKENS, number
 from kerv_cli.base.registry import AcceptancePart, BoundaryPart
-from kerv_cli.engine.acceptance import ROOT, Accepted, DistanceRule, TokenTree, nearest_child
-from kerv_cli.engine.decisions import Choice
+from kerv_cli.engine.acceptance import Accepted, DistanceRule, nearest_child
+from kerv_cli.engine.decisions import ROOT, Choice, TokenTree
 from kerv_cli.engine.parts import Boundary
 
 if TYPE_CHECKING:

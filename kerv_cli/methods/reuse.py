@@ -63,8 +63,8 @@ class JacobiProposer(ChainProposer):
             target_tokens: The target's prediction after token `first`, then after each token of the guess, also
                 after rejected tokens.
         """
-        accepted = len(chunk.tokens) - first - 2
-        self.guess = [*target_tokens[accepted + 1 :], *self.guess[len(target_tokens) - 1 :]]
+        known = [*target_tokens, *self.guess[len(target_tokens) :]]  # of the places after token `first`
+        self.guess = known[len(chunk.tokens) - first - 1 :]
 
 
 @dataclass

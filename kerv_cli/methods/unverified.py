@@ -123,7 +123,8 @@ class StreakSkip(Skip):
         """
         targets, tolerance, agrees = chunk.targets_along(self.chain), self.settings.tolerance, False
         if targets is not None:
-            whole = chunk.rounds[-1].accepted == len(chunk.rounds[-1].drafted)
+            accepted = chunk.rounds[0].drafted[: chunk.rounds[0].accepted]
+            whole = accepted == self.chain[: len(targets)]
             agrees = whole or (tolerance > 0 and chunk.distance(self.chain[: len(targets)], targets) <= tolerance)
         self.allowed = self.left = min(self.settings.most, 2 * self.allowed or 1) if agrees else 0
 

@@ -23,8 +23,8 @@ from torch import Tensor, nn
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import ObservationSpace
-from kerv_cli.engine.acceptance import ROOT
 from kerv_cli.engine.chunk import Chunk
+from kerv_cli.engine.decisions import ROOT
 from kerv_cli.engine.decoder import Decoder, Parts, greedy
 from kerv_cli.engine.draft import HOST, Draft, upload
 from kerv_cli.engine.parts import Fixed

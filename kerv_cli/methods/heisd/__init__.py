@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from kerv_cli.base import registry
 from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, number
-from kerv_cli.engine.acceptance import Accepted, DistanceRule, TokenTree, accept_by_group
-from kerv_cli.engine.decisions import Choice, SkipDecision
+from kerv_cli.engine.acceptance import Accepted, DistanceRule, accept_by_group
+from kerv_cli.engine.decisions import Choice, SkipDecision, TokenTree
 from kerv_cli.engine.parts import Boundary, Skip
 from kerv_cli.engine.proposer import ChainProposer, Proposer
 from kerv_cli.methods.eagle import DrafterProposerSettings, only_of_trees

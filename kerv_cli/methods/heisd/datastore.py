@@ -31,7 +31,7 @@ from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.registry import SearchPart
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.engine.acceptance import ROOT
+from kerv_cli.engine.decisions import ROOT
 from kerv_cli.engine.draft import Draft, read
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.methods.artifacts import Artifact, Artifacts

@@ -58,7 +58,7 @@ def predictor(settings: NoSettings, context: Context) -> Predictor:
 
     kind, held, horizon = PREDICTORS[settings.kind], context.target.actions.is_strict, context.target.chunk
     if not issubclass(kind, Kalman):
-        return kind(held, minimum=kind.least, horizon=horizon)
+        return kind(held, horizon=horizon)
     fitted = context.calibration
     return kind(held, fitted.noise[kind.name], window=fitted.window, horizon=horizon)
 

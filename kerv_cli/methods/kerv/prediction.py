@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from kerv_cli.engine.chunk import Chunk
     from kerv_cli.methods.kerv import CompensateSettings
 
-MINIMUM = 4  # minimum number of past actions; longer windows were not measurably better on the demonstrations
+MINIMUM = 4  # past actions that a filter needs; longer windows were not measurably better on the demonstrations
 HORIZON = 8  # number of control steps ahead for which weights are computed
 
 
@@ -96,8 +96,7 @@ class Predictor:
 
     Attributes:
         name: Name of the predictor in settings.
-        least: Minimum number of past actions that the formula needs.
-        minimum: Minimum number of past actions for a prediction. With fewer, nothing is predicted.
+        least: Minimum number of past actions for a prediction. With fewer, nothing is predicted.
     """
 
     name = ""
@@ -107,7 +106,7 @@ class Predictor:
         self,
         held: np.ndarray,
         noise: Noise | None = None,
-        minimum: int = MINIMUM,
+        minimum: int | None = None,
         window: int = WINDOW,
         horizon: int = HORIZON,
     ) -> None:
@@ -118,14 +117,14 @@ class Predictor:
         Args:
             held: (D,) bool, whether the DoF keeps its last value.
             noise: Fitted noise of a Kalman filter. None if the predictor needs no fitted noise.
-            minimum: Smallest number of past actions from which actions are predicted.
+            minimum: Minimum number of past actions for a prediction. If None, it is `least`.
             window: Maximum number of past actions that are used.
             horizon: Maximum number of control steps ahead.
         """
         self.held, self.dofs, self.noise = np.asarray(held, dtype=bool), len(held), noise
-        self.minimum, self.window, self.horizon = minimum, window, horizon
+        self.minimum, self.window, self.horizon = self.least if minimum is None else minimum, window, horizon
         self.tables = {}  # for each number of past actions the weights (D, horizon, past actions) of all DoFs
-        for past in range(minimum, window + 1):
+        for past in range(self.minimum, window + 1):
             table = np.tile(Predictor.weights(self, 0, past), (self.dofs, 1, 1))
             for dof in np.flatnonzero(~self.held):
                 table[dof] = self.weights(int(dof), past)
@@ -202,6 +201,7 @@ class Kalman(Predictor):
     """A Kalman filter with constant velocity, per DoF (docs/methods.md §3.1)."""
 
     name = "kalman"
+    least = MINIMUM
 
     def weights(self, dof: int, window: int) -> np.ndarray:
         """Return the weights (horizon, window) of the last `window` actions in the filter's predictions for one DoF."""
@@ -218,6 +218,7 @@ class Walk(Predictor):
     """
 
     name = "walk"
+    least = MINIMUM
     noise_ratio = 1.0 / 1e-3  # Q / R
 
     def weights(self, dof: int, window: int) -> np.ndarray:
