@@ -12,6 +12,7 @@ from mock_target import SEVEN, MockTarget
 from test_acceptance import space_of
 
 from kerv_cli.base.codes import FastCode
+from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.chunk import Chunk
@@ -20,9 +21,11 @@ from kerv_cli.engine.decoder import BatchDecoder, Decoder, Parts
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import Target
+from kerv_cli.episodes.settings import RolloutSettings
+from kerv_cli.methods.compose import Method
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter, EagleNetwork
-from kerv_cli.methods.reuse import JacobiProposer, JacobiProposerSettings
+from kerv_cli.methods.reuse import JacobiProposer, JacobiProposerSettings, LastActionProposer
 from kerv_cli.targets.compact.features import WordTokenizer
 from kerv_cli.targets.compact.program import compile_parts
 from kerv_cli.targets.compact.target import CompactTarget
@@ -275,6 +278,54 @@ def test_any_target_is_decoded_losslessly(seed, actions, chunk, words, nodes, in
     result = Decoder(target, Parts(prefill_draft=first, proposer=trees)).decode_prompt(prompt)
     assert result.tokens == truth
     assert_adds_up(result)
+
+
+@settings(max_examples=40)
+@given(
+    seed=st.integers(0, 10_000),
+    actions=spaces(),
+    chunk=st.integers(1, 4),
+    coded=st.booleans(),
+    executed=st.lists(st.integers(0, 4), min_size=2, max_size=6),
+    after=st.sampled_from(["jacobi", "last_action", "none"]),
+)
+def test_an_episode_of_last_action_is_decoded_losslessly(seed, actions, chunk, coded, executed, after):
+    """Whatever was executed between two decodes: nothing, a part of the chunk, all of it, or something else."""
+    space = dataclasses.replace(actions, code=short_code(chunk, actions.dofs)) if coded else actions
+    target, random = MockTarget(space, chunk, seed=seed), np.random.default_rng(seed)
+    method = Method.of(
+        compose("rollout", ["method=last_action", f"proposer={after}", "threshold.r=0"], RolloutSettings)
+    )
+    decoder, plain, drafted = method.decoder(target, lambda kind: None), Decoder(target), False
+    decoder.reset("t", seed, np.zeros(3))
+    for number, steps in enumerate(executed):
+        shown = Observation(np.array([0.01 * (seed % 7 + number)]), np.zeros(0), "word word")
+        record = decoder.decode(shown)
+        assert record.tokens == plain.decode(shown).tokens
+        drafted |= bool(number) and record.rounds[0].proposer == "last_action"
+        for action in [*record.actions, random.uniform(-1, 1, space.dofs)][:steps]:
+            decoder.observe(action, np.zeros(3))
+    assert drafted or space.longest(chunk) == 1
+
+
+def test_last_action_drafts_the_rest_of_the_last_chunk_then_its_last_action():
+    target = MockTarget(SEVEN, 4, seed=1)
+    decoder = Decoder(target, Parts(prefill_draft=LastActionProposer()))
+    decoder.reset("t", 0, np.zeros(3))
+    shown = Observation(np.array([0.3]), np.zeros(0), "word")
+    chunk = decoder._new_chunk(target.encode(shown))
+    propose = LastActionProposer().chains
+    assert propose(chunk, 27) == []
+    tokens = list(decoder.decode(shown).tokens)
+    rows = np.reshape(tokens, (4, 7))
+    for executed in range(6):
+        expected = rows[[min(executed + step, 3) for step in range(4)]].flatten().tolist()
+        chunk.tokens = []
+        assert propose(chunk, 28) == [expected]
+        assert propose(chunk, 5) == [expected[:5]]
+        chunk.tokens = expected[:9]  # a step and two tokens are committed
+        assert propose(chunk, 7) == [expected[9:16]]
+        decoder.observe(SEVEN.decode(rows[min(executed, 3)]), np.zeros(3))
 
 
 def test_a_chunk_ends_at_its_end_token_and_a_batch_decodes_the_same():

@@ -225,9 +225,13 @@ class ActionSpace:
 
         With FAST tokens, a chunk may have fewer than N tokens. Its row is then filled up with end tokens.
         """
+        return self.normalised_tokens(self.normalise(chunks))
+
+    def normalised_tokens(self, chunks: np.ndarray) -> np.ndarray:
+        """Return what `chunk_tokens` returns, for chunks (n, H, D) of normalised actions."""
         if self.code is None:
-            return self.encode(chunks).reshape(len(chunks), -1)
-        return self.code.encode(self.code.coefficients(self.normalise(chunks)))
+            return self.bins_of(chunks).reshape(len(chunks), -1)
+        return self.code.encode(self.code.coefficients(chunks))
 
     def chunk_values(self, tokens: Sequence[int], steps: int) -> np.ndarray:
         """Return the normalised actions (h, D) of a chunk's tokens.

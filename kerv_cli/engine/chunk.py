@@ -52,6 +52,7 @@ class Follower:
         task: Name of the running episode's task.
         path: Measured positions of the end effector, (3,) each, metres, oldest first.
         last: Tokens of the chunk that was decoded last.
+        planned: Normalised actions (D,) of that chunk for the control steps that are still to come.
     """
 
     def __init__(self, space: ActionSpace, cameras: tuple[str, ...] = ()) -> None:
@@ -59,7 +60,7 @@ class Follower:
         self._start("", [])
 
     def _start(self, task: str, path: list[np.ndarray]) -> None:
-        self.task, self.path, self.last = task, path, list[int]()
+        self.task, self.path, self.last, self.planned = task, path, list[int](), list[np.ndarray]()
         self._executed = np.zeros((0, self.space.dofs))
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
@@ -80,6 +81,7 @@ class Follower:
         """Store an action (D,) that was executed, environment units, and the position (3,) after it, metres."""
         self._executed = np.concatenate([self._executed, self.space.normalise(action)[None]])[-WINDOW:]
         self.path.append(np.asarray(end_effector))
+        del self.planned[:1]
 
     def history(self, pending: np.ndarray | None = None) -> np.ndarray:
         """Return the last executed actions (m, D), oldest first, normalised and not rounded to tokens; m ≤ WINDOW.
@@ -326,11 +328,18 @@ class Chunk:
 
         S is `steps`, or fewer if a rectifier ended the chunk early.
         """
-        values = self.closed
-        if values is None:
-            values = self.space.chunk_values(self.tokens, self.steps)
-            values.flat[list(self.filled)] = list(self.filled.values())
-        return self.space.unnormalise(values).astype(np.float32)
+        return self.space.unnormalise(self.values(self.steps)).astype(np.float32)
+
+    def values(self, steps: int) -> np.ndarray:
+        """Return the normalised actions (S, D) of the complete chunk.
+
+        S is `steps` for FAST tokens, otherwise the number of decoded control steps.
+        """
+        if self.closed is not None:
+            return self.closed
+        values = self.space.chunk_values(self.tokens, steps)
+        values.flat[list(self.filled)] = list(self.filled.values())
+        return values
 
     def record(
         self, actions: np.ndarray, seconds: float, phases: dict[str, float], similarity: float | None = None

@@ -186,7 +186,7 @@ class Decoder(Follower):
 
         chunk = self.decode_prompt(encode, stopwatch)
         actions = chunk.actions()
-        self.last = chunk.tokens
+        self.last, self.planned = chunk.tokens, [*chunk.values(self.target.chunk)]
         self.threshold.update(variability(chunk.rounds, self.space, self.threshold.measure))
         if self.parts.rectifier is not None:
             self.parts.rectifier.next_decode()

@@ -7,7 +7,7 @@
     kerv                        KERV: predictions from the motion, and thresholds that follow the motion
     unverified                  tokens without verification: OpenVLA-OFT's parallel pass, drafts, streaks
     heisd                       HeiSD: retrieved drafts, a boundary between two drafters, skipped verification
-    reuse                       Jacobi decoding as in PD-VLA, and prompt lookup in the last chunk's tokens
+    reuse                       Jacobi decoding as in PD-VLA, prompt lookup, and the last action as a draft
     merged                      ours: several drafts in one tree, before the prefill (`method=one_pass`)
     motion                      ours: accept FAST tokens, and stop decoding, by the motion that the tokens stand for
 

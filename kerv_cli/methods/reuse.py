@@ -1,6 +1,6 @@
-"""Proposers that reuse known tokens: the target's last predictions (Jacobi), or the last chunk (prompt lookup).
+"""Proposers that reuse what is known: the target's last predictions (Jacobi), the last chunk or the last action.
 
-The Jacobi decoding is PD-VLA's, and the prompt lookup decoding is Saxena's (2023). docs/methods.md §6 describes both.
+docs/methods.md §5.2 and §6 describe them.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from kerv_cli.base.limits import MOST_TOKENS, number
-from kerv_cli.base.registry import PREFILL, STATES, ProposerPart
+from kerv_cli.base.registry import PREFILL, STATES, NoSettings, ProposerPart
 from kerv_cli.engine.proposer import ChainProposer
 
 if TYPE_CHECKING:
@@ -95,3 +95,30 @@ class LookupProposer(ChainProposer):
                 nearest = min(places, key=lambda place: abs(place - len(tokens)))
                 return [last[nearest:][:depth]]
         return [last[len(tokens) :][:depth]]
+
+
+@ProposerPart("last_action", NoSettings, colour=0x2CA25F, when=PREFILL, chains=True, any_code=True)
+class LastActionProposer(ChainProposer):
+    """Drafts the steps of the last chunk that are still to come, then its last action again and again (ours, §5.2).
+
+    FAST tokens encode whole chunks, so these actions are encoded together.
+    """
+
+    name = "last_action"
+
+    def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
+        """Return one chain of at most `depth` tokens. There is none before an episode's first action."""
+        import numpy as np
+
+        space, episode = chunk.space, chunk.episode
+        steps = space.code.steps if space.code else chunk.steps
+        done = 0 if space.code else len(chunk.tokens) // space.dofs
+        known = space.values_of(np.array(chunk.tokens[: done * space.dofs], dtype=np.int64)).reshape(done, space.dofs)
+        past = episode.history(known)
+        ahead = episode.planned[done:steps]
+        if not ahead and not len(past):
+            return []
+        last = ahead[-1] if ahead else past[-1]
+        actions = np.stack([*ahead, *[last] * (steps - done - len(ahead))])
+        tokens: list[int] = space.normalised_tokens(actions[None])[0].tolist()
+        return [tokens[len(chunk.tokens) - done * space.dofs :][:depth]]

@@ -53,6 +53,7 @@ METHODS = {
     "heisd": "similar demonstrations draft; very similar ones run unverified",
     "jacobi": "guesses all tokens and corrects them in parallel, without a drafter",
     "kerv": "Spec-VLA; after a rejection a Kalman filter predicts the rest",
+    "last_action": "the last action drafts, only equal tokens are accepted, nothing is trained",
     "naive_sd": "a small network drafts, only equal tokens are accepted",
     "one_pass": "a network drafts the action; one run verifies prompt and draft",
     "parallel": "a policy that writes all tokens in one run",
@@ -67,6 +68,7 @@ WORDS = {
     "skip": "drafts that are similar enough run unverified",
     "streak": "after drafts that agree, more of them run unverified",
     "strict": "accepts only tokens that equal the policy's",
+    "tree": "then a small network drafts a tree of tokens",
     "tuned": "changed by us, to suit these policies",
 }
 """Word in the label of a setting -> what the word means."""
