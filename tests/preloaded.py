@@ -10,10 +10,8 @@ from collections.abc import Mapping, Sequence
 import pandas  # noqa: F401
 import studies_synthetic  # noqa: F401
 
-from kerv_cli.episodes.identity import code_hash
 from kerv_cli.targets.provenance import stamp
 
-code_hash()
 stamp("cpu")
 
 

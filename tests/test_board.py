@@ -189,7 +189,7 @@ def test_pages_are_quick_with_ten_thousand_episodes_and_two_hundred_runs(tmp_pat
         pass
     names = ("work", "task", "seed")
     with store.database.writing() as connection:
-        connection.execute(sa.insert(BLOCKS).values(id="b", run="r", seeds="", started=now(), code="", about={}))
+        connection.execute(sa.insert(BLOCKS).values(id="b", run="r", seeds="", started=now(), about={}))
         connection.execute(
             sa.insert(EPISODES),
             [

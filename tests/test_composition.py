@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from dataclasses import asdict
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,9 +14,8 @@ from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.settings import RuntimeSettings, read_settings
-from kerv_cli.episodes.identity import effective, idle_keys, without_effect
 from kerv_cli.episodes.policy import check as check_rollout
-from kerv_cli.episodes.resolve import Point, ResolvedStudy, idle_overrides
+from kerv_cli.episodes.resolve import Point, ResolvedStudy, idle_keys, idle_overrides
 from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 from kerv_cli.methods import heisd
 from kerv_cli.methods.compose import Method
@@ -150,6 +148,10 @@ def test_only_what_needs_no_states_can_be_chosen_before_the_prefill():
         ("policy=expert rollout.batch=8", "policy=expert"),
         ("policy=state rollout.batch=8 rollout.clock=real", "rollout.clock=real"),
         ("policy=state rollout.batch=8 deviation_every=2", "deviation_every=2"),
+        (
+            "policy=vision world.camera.name=topview",
+            "camera.name=topview: mt10-vision sees corner4, leave it out",
+        ),
     ],
 )
 def test_a_rollout_that_cannot_be_is_refused(overrides, says):
@@ -211,8 +213,9 @@ def test_a_method_needs_what_its_parts_read_and_nothing_else(overrides, wanted):
     ],
 )
 def test_an_override_without_effect_is_found(words, idle):
-    settings = compose("rollout", words.split(), RolloutSettings)
-    assert " ".join(without_effect(settings, words.split())) == idle
+    settings = {"x": compose("rollout", words.split(), RolloutSettings)}
+    points = {"x": Point("x", tuple(words.split()))}
+    assert " ".join(idle_overrides(ResolvedStudy(SweepSettings(), settings, points), sweep=False)) == idle
 
 
 def test_no_rectifier_counts_in_the_shipped_methods_that_verify_nothing():
@@ -221,7 +224,6 @@ def test_no_rectifier_counts_in_the_shipped_methods_that_verify_nothing():
     for name in names:
         settings = compose("rollout", [f"method={name}"], RolloutSettings)
         assert "rectifier" in idle_keys(settings)
-        assert "rectifier" not in effective(asdict(settings))
 
 
 def test_a_sweep_names_what_none_of_its_settings_reads():

@@ -167,7 +167,7 @@ def _stored_episodes(connection: sa.Connection, path: Path, settings: dict[int, 
         CheckpointError: The file is damaged, or the decodes of an episode are too large.
     """
     blocks, decodes = tables.BLOCKS.c, tables.DECODES
-    of_block = blocks.id.label("block"), blocks.about, blocks.run, blocks.seeds, blocks.code
+    of_block = blocks.id.label("block"), blocks.about, blocks.run, blocks.seeds
     stored = [*measures_in(connection), *tables.EPISODES.c[_FURTHER]]
     measures = [column.label(f"row.{name}") for name, column in zip(_ROW, stored, strict=True)]
     query = (
@@ -182,7 +182,7 @@ def _stored_episodes(connection: sa.Connection, path: Path, settings: dict[int, 
             episode = Episode(settings[row["setting_id"]], row["task"], row["seed"])
             values = {name: row[f"row.{name}"] for name in _ROW}
             decoded = foreign_table(row["parquet"]).cast(DECODE_SCHEMA)
-            block = row["block"], row["about"], row["run"], row["seeds"], row["code"]
+            block = row["block"], row["about"], row["run"], row["seeds"]
             yield ImportedEpisode(episode, values, decoded, *block)
 
 

@@ -236,14 +236,12 @@ def print_study(data: StudyData, all_columns: bool = False, how: str = "", expla
     if explain:
         for name, text in explanations(study.settings).items():
             typer.echo(f"{name}: {text}")
-    codes = split_values(row.provenance["code"] for row in data.results)
-    if len(codes) > 1:
-        commits = split_values(row.provenance["git_commit"] for row in data.results)
-        names = ", ".join(sorted(commit[:12] for commit in commits))
-        typer.echo(f"its episodes are of {len(codes)} states of the code, commits {names}")
+    commits = split_values(row.provenance["git_commit"] for row in data.results)
+    if len(commits) > 1:
+        typer.echo(f"its episodes are of {len(commits)} commits: {', '.join(sorted(one[:12] for one in commits))}")
     apart = not_in_turn(data.results)
     if apart:
-        mend = study.sweep_command("rerun=timed")
+        mend = study.sweep_command("rerun=all")
         typer.echo(f"no speedup of {', '.join(apart)}: not measured in turn with the baseline; '{mend}' does that")
     if data.study.note:
         typer.echo(f"\n{data.study.note}\n")

@@ -67,6 +67,10 @@ def check(settings: RolloutSettings) -> dict[str, str]:
     artifacts = artifacts_of(settings)
     target = artifacts.description
     target.check_world(settings.policy.target, spec.name, spec.actions, settings.world.camera.size)
+    camera = settings.world.camera.name
+    if target.cameras and camera not in ("", spec.cameras[0], *target.cameras):
+        sees = ", ".join(target.cameras)
+        raise UsageError(f"world.camera.name={camera}: {settings.policy.target} sees {sees}, leave it out")
     method = Method.of(settings)
     if settings.deviation_every > 0:
         target.check_autoregressive(f"deviation_every={settings.deviation_every}", "there is no AR to differ from")

@@ -10,7 +10,7 @@ from typing import Any
 from kerv_cli.base.config import as_overrides, groups, split
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import PART_GROUPS
-from kerv_cli.episodes.identity import Identity, Plain, effective, flat, work_of
+from kerv_cli.episodes.identity import Identity, Plain, determining, flat, work_of
 from kerv_cli.episodes.resolve import resolve_rollout
 from kerv_cli.methods.settings import EXPERT
 
@@ -61,7 +61,7 @@ def _first_word(settings: Plain, typed: str) -> str:
 def _keys(settings: Plain) -> dict[str, Any]:
     """Return all settings `policy.*` and the other settings that determine a result, with dotted keys."""
     policy: Mapping[str, Any] = settings["policy"]
-    return {**flat({"policy": policy}), **flat(effective(settings))}
+    return {**flat({"policy": policy}), **flat(determining(settings))}
 
 
 def _text(value: Any) -> str:

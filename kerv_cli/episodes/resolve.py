@@ -14,9 +14,19 @@ from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.files import read_yaml_lines
 from kerv_cli.base.limits import check_label
 from kerv_cli.base.paths import find_target
-from kerv_cli.base.registry import METHOD_KINDS
-from kerv_cli.episodes.identity import flat, without_effect
-from kerv_cli.episodes.settings import DEFAULT_TASKS, RolloutSettings, StudySettings, SweepSettings
+from kerv_cli.base.registry import METHOD_KINDS, PART_GROUPS, AcceptancePart, ArtifactPart
+from kerv_cli.episodes.identity import NOT_DETERMINING_RUNTIME, flat
+from kerv_cli.episodes.settings import (
+    CONSTANT,
+    DEFAULT_TASKS,
+    PROFILE,
+    REAL,
+    WAITS,
+    RolloutSettings,
+    StudySettings,
+    SweepSettings,
+)
+from kerv_cli.methods.compose import Method
 from kerv_cli.methods.settings import EXPERT
 from kerv_cli.worlds import resolve_tasks, settled
 
@@ -267,12 +277,62 @@ def idle_overrides(resolved: ResolvedStudy, sweep: bool = True) -> dict[str, str
     reasons: dict[str, str] = {}
     in_each = []
     for label, settings in resolved.settings.items():
+        idle = idle_keys(settings)
+        if not sweep:
+            idle |= {f"runtime.{name}": "a rollout runs in one process" for name in NOT_DETERMINING_RUNTIME}
         name = f"{label}: " if len(resolved.settings) > 1 else ""
-        for word, why in without_effect(settings, resolved.points[label].overrides, sweep).items():
+        for word, why in _without_effect(resolved.points[label].overrides, idle).items():
             reasons[f"{name}{word}"] = why
-        in_each.append(without_effect(settings, resolved.common, sweep))
+        in_each.append(_without_effect(resolved.common, idle))
     everywhere = set(in_each[0]).intersection(*in_each)
     return reasons | {word: why for word, why in in_each[0].items() if word in everywhere}
+
+
+def _without_effect(overrides: Iterable[str], idle: Mapping[str, str]) -> dict[str, str]:
+    reasons: dict[str, str] = {}
+    for override in overrides:
+        key = _key(override).lstrip("+")
+        for name, reason in idle.items():
+            if f"{key}.".startswith(f"{name}."):
+                reasons.setdefault(override, reason)
+    return reasons
+
+
+def idle_keys(settings: RolloutSettings) -> dict[str, str]:
+    """Return the keys of settings that have no effect in this combination, each with the reason.
+
+    Empty for the scripted expert: unused settings are refused there.
+    """
+    if settings.policy.kind == EXPERT:
+        return {}
+    method, timing, batch = Method.of(settings), settings.rollout, settings.rollout.batch
+    draft, proposer, skip, needed = method.prefill_draft, method.proposer, method.skip, set(method.needs)
+    acceptance = AcceptancePart.find(settings.acceptance.kind)
+    idle: dict[str, str] = {}
+    if proposer.absent and draft.absent:
+        idle |= dict.fromkeys(("acceptance", "threshold", "rectifier"), f"method {settings.method} drafts nothing")
+    elif not skip.verifies and (draft.drafts_whole_chunk or proposer.absent):
+        idle["rectifier"] = f"skip={skip.name} verifies nothing, so nothing is rejected"
+    elif not acceptance.reads_threshold:
+        idle["threshold"] = f"acceptance={acceptance.name} has no threshold"
+    for kind, part in method.parts.items():
+        idle |= flat({kind: part.idle(method.settings[kind])})
+    for kind in ArtifactPart.every().keys() - needed:
+        idle[f"policy.artifacts.{kind}"] = f"method {settings.method} reads no {kind}"
+    for group in set(PART_GROUPS[len(METHOD_KINDS) :]) - needed:
+        idle[group] = f"method {settings.method} reads no {group}"
+    if timing.clock == WAITS:
+        names = "latency", "latency_ms", "profile", "ar_ms", "delay_compensation"
+        idle |= dict.fromkeys(map("rollout.{}".format, names), "rollout.clock=waits: the world waits for every decode")
+    elif timing.latency != CONSTANT:
+        idle["rollout.latency_ms"] = f"rollout.latency={timing.latency}"
+    if timing.clock == REAL and timing.latency != PROFILE:
+        idle["rollout.profile"] = idle["rollout.ar_ms"] = f"rollout.latency={timing.latency} reads no profile"
+    if batch > 1:
+        idle |= dict.fromkeys(("record", "record_size"), f"rollout.batch={batch}: episodes of a batch are not recorded")
+    if not settings.record:
+        idle["record_size"] = "record=0 saves no recording"
+    return idle
 
 
 def tasks_of(settings: RolloutSettings) -> tuple[str, ...]:

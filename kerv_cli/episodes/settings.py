@@ -107,8 +107,7 @@ class SweepSettings(CommandSettings):
     groups: ClassVar = {"study": "threshold"}
 
     study: StudySettings = setting(StudySettings, "which settings are compared: a name in conf/study, or a file")
-    # timed: settings that were not timed alternately with the baseline; changed: episodes that other code ran
-    rerun: str = choice("never", "never", "timed", "changed", "all", help="which existing episodes run again")
+    rerun: str = choice("never", "never", "all", help="which existing episodes run again")
     loss: float = number(3.0, above=0, most=99.9, help="largest loss of success that the verdict accepts, points")
 
 

@@ -147,7 +147,7 @@ SETTINGS = _table(
 BLOCKS = _table(
     "blocks",  # one attempt to run a group of episodes in one process, with settings taking turns
     sa.Column("id", _TEXT, primary_key=True),
-    *_required(_TEXT, "run", "seeds", "started", "code"),  # code: hash of the source code
+    *_required(_TEXT, "run", "seeds", "started"),
     *_required(_OBJECT, "about"),  # machine, versions, commit, executor, workers
 )
 _TYPES = {FLAG: sa.Boolean, INT: sa.BigInteger, FLOAT: sa.Double}
@@ -162,7 +162,7 @@ EPISODES = _table(
     sa.Column("block", sa.ForeignKey("blocks.id"), nullable=False),
     *MEASURES,
     *_required(sa.LargeBinary, "decode_seconds"),  # (decodes,) little-endian float64
-    # the same episode may run again in another block, with other settings or other code
+    # the same episode may run again in another block, with other settings
     sa.UniqueConstraint("work", "task", "seed", "block"),
 )
 DECODES = _table(

@@ -17,20 +17,15 @@ from typing import TypeVar
 
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
-from kerv_cli.episodes.identity import Setting, code_hash, differences
+from kerv_cli.episodes.identity import Setting, differences
 
 MOST_EPISODES = 1_000_000
 """Largest number of episodes in a study."""
 FULL_BATCHES = 16
 """Largest number of batches in a block."""
 
-NEVER, TIMED, CHANGED, ALL = "never", "timed", "changed", "all"
-"""Values of `rerun=`, which says which existing episodes to run again.
-
-NEVER runs no existing episode again. TIMED runs the episodes of a task and seed again unless one block ran them
-for all settings in turn. CHANGED runs the episodes again that ran with another version of the code. ALL runs all
-episodes again.
-"""
+NEVER, ALL = "never", "all"
+"""Values of `rerun=`: which existing episodes run again."""
 
 Key = tuple[str, str, int]
 """A setting's hash `work`, task and seed. Equal keys mean the same episode in any study."""
@@ -93,7 +88,6 @@ class StoredEpisode:
         block: Id of the block (episodes run by one process) in which it ran.
         run: Id of the command that ran it.
         started: Time at which that block began (ISO 8601).
-        code: Hash of the code that ran it.
         seeds: Seeds of the block, as `seeds_text` writes them.
     """
 
@@ -103,7 +97,6 @@ class StoredEpisode:
     block: str
     run: str
     started: str
-    code: str
     seeds: str
 
 
@@ -177,7 +170,7 @@ def split(
     stored: Mapping[Key, Sequence[StoredEpisode]],
     rerun: str = NEVER,
     since: str = "",
-    earlier: Mapping[str, tuple[Setting, str]] | None = None,
+    earlier: Mapping[str, Setting] | None = None,
 ) -> tuple[dict[Episode, StoredEpisode], dict[Episode, str]]:
     """Divide a study's episodes into existing and missing ones.
 
@@ -185,22 +178,18 @@ def split(
         episodes: The study's episodes.
         block: Number of seeds in a block, which one process runs.
         stored: Episodes in the database, by `Episode.key`.
-        rerun: Which existing episodes to run again. NEVER: none. TIMED: for each task and seed, the episodes of
-            all settings, unless one block ran all of them in turn. Only then can their times be compared. CHANGED: the
-            episodes that ran with another version of the code. ALL: all.
+        rerun: Which existing episodes to run again: NEVER or ALL.
         since: Used only with ALL, if a command is resumed: the time at which it first began (ISO 8601). Episodes of
             blocks that began then or later count as existing, because this command ran them. If empty, all episodes
             run again.
-        earlier: The newest stored setting and its hash, by label. Used to explain what has changed.
+        earlier: The newest stored setting by label. Used to explain what has changed.
 
     Returns:
         Two mappings: from each existing episode to its row, and from each missing episode to the reason for running it.
     """
 
     def is_usable(row: StoredEpisode) -> bool:
-        if rerun == ALL:
-            return bool(since) and row.started >= since
-        return rerun != CHANGED or row.code == code_hash()
+        return rerun != ALL or (bool(since) and row.started >= since)
 
     usable: dict[Episode, list[StoredEpisode]] = {}
     for one in episodes:
@@ -208,10 +197,7 @@ def split(
     _keep_whole_orders(usable, block)
     existing: dict[Episode, StoredEpisode] = {}
     for turn in _turns(episodes).values():
-        found = _rows_of_turn(turn, usable)
-        is_one_block = len(found) == len(turn) and len(set(map(attrgetter("block"), found.values()))) == 1
-        if rerun != TIMED or is_one_block:
-            existing |= found
+        existing |= _rows_of_turn(turn, usable)
     for part in _ordered_parts(episodes, block):
         if not existing.keys() >= set(part):
             for one in part:
@@ -242,18 +228,18 @@ def _reasons(
     stored: Mapping[Key, Sequence[StoredEpisode]],
     existing: Mapping[Episode, StoredEpisode],
     rerun: str,
-    earlier: Mapping[str, tuple[Setting, str]],
+    earlier: Mapping[str, Setting],
 ) -> dict[Episode, str]:
     """Return the missing episodes, each with the reason for running it. `split` explains the arguments."""
     works, tasks = set(), set()
     for work, task, *_ in stored:
         works.add(work)
         tasks.add((work, task))
-    of_rows = {TIMED: "times wanted in turn", CHANGED: "other code", ALL: "rerun=all"}.get(rerun, "order of episodes")
+    of_rows = "rerun=all" if rerun == ALL else "order of episodes"
 
     @functools.cache
     def change(setting: Setting) -> str:
-        return differences(setting, *earlier.get(setting.label, ()))
+        return differences(setting, earlier.get(setting.label))
 
     reasons = {}
     for one in episodes:

@@ -61,7 +61,6 @@ class ImportedEpisode:
         about: Machine and versions that ran the block.
         run: Id of the run (the command that ran it). If empty, the run that imports the episode is stored.
         seeds: Seeds of the block, as `seeds_text` writes them.
-        code: Hash of the code that ran it.
     """
 
     episode: Episode
@@ -71,7 +70,6 @@ class ImportedEpisode:
     about: Mapping[str, Any]
     run: str = ""
     seeds: str = ""
-    code: str = ""
 
 
 def _same_episode() -> sa.ColumnElement[bool]:
@@ -232,7 +230,7 @@ class Study:
         """Compare the episodes with the database. Return the study with its existing and missing episodes.
 
         Args:
-            rerun: Which existing episodes to run again: NEVER, TIMED, CHANGED or ALL (`lab/plan.py`).
+            rerun: Which existing episodes to run again: NEVER or ALL (`lab/plan.py`).
             since: Used only with ALL, if an interrupted command is resumed: the time at which that command began (ISO
                 8601). Episodes of blocks that began then or later do not run again, because that command ran them. If
                 empty, all episodes run again.
@@ -258,7 +256,7 @@ class Study:
         stored: dict[Key, list[StoredEpisode]] = {}
         columns = (
             EPISODES.c.work, EPISODES.c.task, EPISODES.c.seed, EPISODES.c.id, EPISODES.c.success,
-            EPISODES.c.wall_seconds, BLOCKS.c.id, BLOCKS.c.run, BLOCKS.c.started, BLOCKS.c.code, BLOCKS.c.seeds,
+            EPISODES.c.wall_seconds, BLOCKS.c.id, BLOCKS.c.run, BLOCKS.c.started, BLOCKS.c.seeds,
         )  # fmt: skip
         works = {setting.work for setting in (block or self).settings}
         query = sa.select(*columns).join(BLOCKS, EPISODES.c.block == BLOCKS.c.id)
@@ -274,13 +272,13 @@ class Study:
                 stored.setdefault((work, task, seed), []).append(StoredEpisode(*row))
         return stored
 
-    def _earlier(self) -> dict[str, tuple[Setting, str]]:
-        """Return, for each label, the newest stored setting that has episodes, and its hash `work`."""
+    def _earlier(self) -> dict[str, Setting]:
+        """Return, for each label, the newest stored setting that has episodes."""
         ran = sa.select(WANTED.c.setting_id).where(WANTED.c.episode_id.is_not(None))
         query = sa.select(SETTINGS).where(SETTINGS.c.label.in_(self.labels), SETTINGS.c.id.in_(ran))
         with self.database.reading() as connection:
             rows = connection.execute(query.order_by(SETTINGS.c.id))
-            return {row.label: (setting_of(row), row.work) for row in rows}
+            return {row.label: setting_of(row) for row in rows}
 
     def save(self) -> None:
         """Write the study's settings and its list of planned episodes.
@@ -356,8 +354,8 @@ class Study:
     def frame(self, episodes: Iterable[Episode] | None = None, run: str | None = None) -> pd.DataFrame:
         """Return the episodes that have been run, in the study's order: one row per label, task and seed.
 
-        Its columns are those of the table `episodes`, with `decode_seconds` as an array. Further columns are `run`,
-        `code`, and the machine and versions that ran the episode.
+        Its columns are those of the table `episodes`, with `decode_seconds` as an array. Further columns are `run`
+        and the machine and versions that ran the episode.
 
         Args:
             episodes: Only these episodes; None for all.
@@ -372,7 +370,7 @@ class Study:
             query = (
                 sa.select(
                     SETTINGS.c.label, WANTED.c.task, WANTED.c.seed, EPISODES.c.id.label("episode"),
-                    *measures_in(connection), *circumstances, BLOCKS.c.run, BLOCKS.c.code, BLOCKS.c.about,
+                    *measures_in(connection), *circumstances, BLOCKS.c.run, BLOCKS.c.about,
                 )
                 .select_from(PLANNED.join(EPISODES, which).join(BLOCKS))
                 .where(STUDIES.c.name == self.name, *([] if run is None else [BLOCKS.c.run == run]))
@@ -431,7 +429,7 @@ class Study:
             self.save_in(connection)
             for one in episodes:
                 block = {"id": one.block, "seeds": one.seeds, "started": one.row.get("started") or now(),
-                         "code": one.code, "about": one.about, "run": one.run or record.id}  # fmt: skip
+                         "about": one.about, "run": one.run or record.id}  # fmt: skip
                 seconds = seconds_blob(one.decodes["seconds"].to_pylist())
                 row = {"order": 0, "started": "", **one.row, "decode_seconds": seconds}
                 self.write(connection, one.episode, block, row, table_blob(one.decodes))

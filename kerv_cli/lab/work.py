@@ -31,7 +31,7 @@ import sqlalchemy as sa
 from kerv_cli.base.errors import CheckpointError, KervError, StorageError
 from kerv_cli.base.runtime import set_up
 from kerv_cli.engine.record import EpisodeRecord
-from kerv_cli.episodes.identity import ENGINE, OBSERVATION, Setting, code_hash
+from kerv_cli.episodes.identity import ENGINE, OBSERVATION, Setting
 from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.rows import decodes_table, episode_row, seconds_blob, table_blob
 from kerv_cli.episodes.runner import Request, Runner, close_worlds, is_recorded, run_batch
@@ -208,7 +208,6 @@ def work(queue: Queue, prepare: Prepare, on_event: OnEvent = lambda event: None)
         KervError: The blocks were planned by another version of kerv.
     """
     load, has_waited, ended = load_per_core(), False, None
-    code_hash()  # takes a second when it is called first, in which this worker should hold no block
     with queue.beating():
         while True:
             claim = patiently(queue.claim, ended)
@@ -639,7 +638,7 @@ class _Attempt:
         claim, runtime = self.claim, self.claim.block.episodes[0].setting.settings["runtime"]
         about = stamp(str(runtime["device"])) | {"engine": ENGINE, "load": self.load} | claim.about
         return {"id": f"{claim.run}-{secrets.token_hex(4)}", "run": claim.run, "seeds": seeds_text(claim.block.seeds),
-                "started": self.started, "code": code_hash(), "about": about}  # fmt: skip
+                "started": self.started, "about": about}  # fmt: skip
 
     def _fail(self, one: Episode, failure: SettingFailed) -> None:
         """Report that a setting failed on a task. Its remaining episodes in the block will not run.

@@ -41,7 +41,7 @@ from kerv_cli.worlds import specs
 RUNTIME = ("device", "dtype", "threads")
 _PROVENANCE = (
     "executor", "workers", "device_name", "host", *map("{}_version".format, PACKAGES), "python_version",
-    "git_commit", "engine", "code", "run", "load",
+    "git_commit", "engine", "run", "load",
 )  # fmt: skip
 
 
@@ -49,7 +49,7 @@ SOLVED = 0.20
 """Smallest success rate at which the baseline counts as solving its tasks."""
 NO_STRESS = "none"
 _AT_ONCE = 200  # episodes in memory at a time
-_ONE_STATE = ("code", "git_commit", "device_name")
+_ONE_STATE = ("engine", "git_commit", "device_name")
 """Columns in which runs must agree. Otherwise their speeds are not averaged."""
 
 
