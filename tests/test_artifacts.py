@@ -25,8 +25,8 @@ from kerv_cli.methods.early.drafter import EarlyDrafter
 from kerv_cli.methods.heisd.datastore import Datastore
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets import checkpoint
-from kerv_cli.training.calibration import calibrate
-from kerv_cli.training.datastore import build_datastore
+from kerv_cli.training.calibration import plan_calibration
+from kerv_cli.training.datastore import plan_datastore
 from kerv_cli.training.settings import BuildDatastoreSettings, CalibrateSettings
 
 STUDY = (
@@ -51,9 +51,9 @@ def whole(policies, tmp_path_factory):
     write_dataset(results / "artifacts/demos/few")
     policy = PolicySettings(target="nano-state")
     built = BuildDatastoreSettings(policy=policy, demos="few", task=list(TASKS), results=str(results))
-    build_datastore(built, Database(results))
+    plan_datastore(built, Database(results)).make()
     words = ["task=reach,drawer-close", "demos=few", "decodes=4", "policy.target=nano-state"]
-    calibrate(compose("calibrate", [*words, f"results={results}"], CalibrateSettings), Database(results))
+    plan_calibration(compose("calibrate", [*words, f"results={results}"], CalibrateSettings), Database(results)).make()
     target, described = checkpoint.load_target(results / "artifacts/target/nano-state")
     drafter = EarlyDrafter().network(EarlySettings(width=16, layers=1), target)
     own = {"settings": asdict(drafter.settings)}
@@ -127,7 +127,7 @@ def test_a_changed_file_is_another_artifact(results):
     assert files.load("datastore") is store
     policy = PolicySettings(target="nano-state")
     built = BuildDatastoreSettings(policy=policy, demos="few", task=list(TASKS), results=str(results), episodes=1)
-    build_datastore(built, Database(results))
+    plan_datastore(built, Database(results)).make()
     after = check(asked)
     assert {kind for kind in before if before[kind] != after[kind]} == {"datastore"}
     again = Artifacts(asked.results, asked.policy).load("datastore")

@@ -47,17 +47,17 @@ from kerv_cli.targets.checkpoint import TargetDescription, read_target
 from kerv_cli.training.calibration import (
     LEAST,
     Matches,
-    calibrate,
     choose_episodes,
     episode_windows,
     fit_noise,
     lowest_level,
     match,
+    plan_calibration,
     reference_level,
     skip_section,
     task_levels,
 )
-from kerv_cli.training.datastore import build_datastore
+from kerv_cli.training.datastore import plan_datastore
 from kerv_cli.training.settings import BuildDatastoreSettings, CalibrateSettings
 from kerv_cli.worlds.demos.dataset import FORMAT, DemoDataset, dataset_hash, episode_path
 from kerv_cli.worlds.demos.files import DemoEpisode, save_episode
@@ -133,7 +133,7 @@ def with_datastore(results, tmp_path_factory):
     folder = Path(shutil.copytree(results, tmp_path_factory.mktemp("skipping") / "results"))
     policy = PolicySettings(target="nano-state")
     built = BuildDatastoreSettings(policy=policy, demos="few", task=list(TASKS), results=str(folder))
-    build_datastore(built, Database(folder))
+    plan_datastore(built, Database(folder)).make()
     return folder
 
 
@@ -150,7 +150,9 @@ def words(results: Path, *overrides: str) -> list[str]:
 
 
 def calibrated(results: Path, *overrides: str) -> tuple[Path, Calibration, list[str]]:
-    return calibrate(compose("calibrate", words(results, *overrides), CalibrateSettings), Database(results))
+    return plan_calibration(
+        compose("calibrate", words(results, *overrides), CalibrateSettings), Database(results)
+    ).make()
 
 
 def test_windows_hold_the_normalised_labels_before_and_after_each_moment():
@@ -434,7 +436,7 @@ def test_the_skip_levels_belong_to_one_datastore(own):
     assert made.skip_levels("reach-v3", store.manifest.content) == (row.low, row.s_min, row.high)
     assert CalibrationArtifact().checked(path, described) == made
     with pytest.raises(
-        CheckpointError, match=r"for datastore \w+, not for eeeeeeeeeeee: run 'kerv calibrate' again, with"
+        CheckpointError, match=r"for datastore \w+, not for eeeeeeeeeeee: run 'kerv calibrate replace=true' with"
     ):
         made.skip_levels("reach-v3", "e" * 64)
     with pytest.raises(CheckpointError, match="no skip level for push-v3, only for reach-v3, drawer-close-v3"):

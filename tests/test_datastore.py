@@ -26,7 +26,7 @@ from kerv_cli.methods.heisd.datastore import Datastore, Shard, check_seeds, neig
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.checkpoint import TargetDescription, load_target
 from kerv_cli.training import datastore as datastore_build
-from kerv_cli.training.datastore import build_datastore
+from kerv_cli.training.datastore import plan_datastore
 from kerv_cli.training.settings import BuildDatastoreSettings
 from kerv_cli.worlds.demos.files import DemoEpisode
 from kerv_cli.worlds.metaworld.spec import SPEC
@@ -97,7 +97,7 @@ def asked(
 
 
 def build(settings: BuildDatastoreSettings) -> tuple[Path, Datastore]:
-    return build_datastore(settings, Database(settings.results))
+    return plan_datastore(settings, Database(settings.results)).make()
 
 
 def folder_of(results: Path, name: str = "nano-state") -> Path:

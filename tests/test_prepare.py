@@ -110,13 +110,14 @@ def test_prepare_makes_what_is_missing_and_skips_what_is_there(results):
     assert "missing" in told("prepare", MINE, "--plan")
     path = results / "artifacts/drafter/mine/drafter.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"target": "0" * 64}))
-    assert "kerv runs rm drafter/mine'" in told("prepare", MINE, "--plan", code=1)
+    assert "type replace=true, or name another" in told("prepare", MINE, "--plan", code=1)
+    assert "of other artifacts" in told("prepare", MINE, "replace=true", "--plan")
 
 
 @pytest.mark.usefixtures("quick_training")
 def test_a_plan_takes_its_time_from_the_most_similar_command_on_this_machine(results):
     train = ("train", "target", "demos=few", "target=nano", "target.observation=state")
-    assert "time unknown" in told(*train, "name=new", "train.steps=4", "--plan")
+    assert "measured now" in told(*train, "name=new", "train.steps=4", "--plan")
     for name, steps, minutes in (("short", 2, 1), ("long", 100, 5)):
         told(*train, f"name={name}", "train.steps=2")
         times = {"started": "2026-01-01T00:00:00+00:00", "finished": f"2026-01-01T00:0{minutes}:00+00:00"}
@@ -124,10 +125,10 @@ def test_a_plan_takes_its_time_from_the_most_similar_command_on_this_machine(res
             connection.execute(sa.update(RUNS).where(RUNS.c.name == name).values(total=steps, **times))
     assert "about 115 s (at the speed of target/short)" in told(*train, "name=new", "train.steps=4", "--plan")
     assert "about 3 min (at the speed of target/long)" in told(*train, "name=new", "train.steps=60", "--plan")
-    assert "time unknown" in told(*train, "name=new", "train.batch=8", "--plan")
+    assert "measured now" in told(*train, "name=new", "train.batch=8", "--plan")
     with opened(results).writing() as connection:
         connection.execute(sa.update(RUNS).values(host="another"))
-    assert "time unknown" in told(*train, "name=new", "--plan")
+    assert "measured now" in told(*train, "name=new", "--plan")
     assert "early: time unknown" in told("prepare", MINE, "--plan")
 
 
@@ -163,13 +164,11 @@ def test_the_remedy_for_weights_of_another_target_works_as_it_is_typed(results):
     told("train", "drafter", MINE, *fast)
     path = results / "artifacts/drafter/mine/drafter.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"target": "0" * 64}))
-    remove, train = typed(told(*rollout, code=1))
-    assert (remove[:3], train) == (["runs", "rm", "drafter/mine"], ["train", "drafter"])
-    train = [*train, MINE]
-    another = told(*train, "train.lr=0.5", "--plan", code=1)
-    assert "choose another policy.artifacts.drafter=, or remove it with 'kerv runs rm drafter/mine'" in another
-    told(*remove, "--yes")
-    told(*train, *fast)
+    (train,) = typed(told(*rollout, code=1))
+    assert train == ["train", "drafter", "replace=true"]
+    another = told("train", "drafter", MINE, "train.lr=0.5", "--plan", code=2)
+    assert "choose another policy.artifacts.drafter=NAME, or type replace=true" in another
+    told(*train, MINE, *fast)
     assert "1 task, " in told(*rollout)
     assert "4000 steps of 64" in told("train", "drafter", MINE, "policy.artifacts.drafter=b", "--plan")
     few = told("train", "drafter", MINE, "policy.artifacts.drafter=b", "train.steps=400", "--plan")
@@ -184,8 +183,9 @@ def test_a_calibration_for_another_datastore_is_refused_by_a_plan_and_made_again
     shutil.rmtree(results / "artifacts/datastore/mine")
     told("build", "datastore", MINE, "components=4")
     (remedy,) = typed(told(*rollout, code=1))
-    assert remedy == ["calibrate", MINE]
-    assert "of other artifacts" in told("prepare", MINE, "--plan")
+    assert remedy == ["calibrate", MINE, "replace=true"]
+    assert "type replace=true" in told("prepare", MINE, "--plan", code=1)
+    assert "of other artifacts" in told("prepare", MINE, "replace=true", "--plan")
     told(*remedy)
     assert "1 task, " in told(*rollout)
     assert "of other artifacts" not in told("prepare", MINE, "--plan")

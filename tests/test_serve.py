@@ -132,6 +132,8 @@ def frame_of(**changes: Any) -> bytes:
         (frame_of(**{"observation/state": np.zeros(5)}), "has shape (5,), 4 or 39 numbers"),
         (frame_of(**{"observation/state": ["a"]}), "does not hold numbers"),
         (frame_of(prompt=3), "prompt is int"),
+        (frame_of(prompt=None), "no prompt: the message must say what the robot has to do"),
+        (frame_of(prompt=" "), "no prompt"),
         (frame_of(prompt="word " * 40), "has 40 words, the policy takes 10"),
         (frame_of(reset=np.zeros(3)), "reset is ndarray"),
         (frame_of(executed=99), "executed=99"),
@@ -254,7 +256,7 @@ def test_the_command_answers_and_stops_when_told(policies, tmp_path, number):
             until(lambda: "listens on" in (tmp_path / "log").read_text(), 60)
             port = int((tmp_path / "log").read_text().rsplit(":", 1)[1])
             client = Client(port)
-            assert client.infer({"observation/state": np.zeros(39), "prompt": ""})["actions"].shape == (4, 4)
+            assert client.infer({"observation/state": np.zeros(39), "prompt": "open"})["actions"].shape == (4, 4)
             client.connection.close()
             until(lambda: "disconnected" in (tmp_path / "log").read_text())
             with silent(port) as seated, socket.create_connection(("127.0.0.1", port)):

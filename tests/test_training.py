@@ -18,6 +18,7 @@ from safetensors.torch import load_file
 from torch import nn
 
 from kerv_cli.base import files
+from kerv_cli.base.codes import FastCode
 from kerv_cli.base.errors import CheckpointError, Interrupted
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.paths import RESUME
@@ -29,7 +30,7 @@ from kerv_cli.targets.losses import soft_labels, token_loss
 from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.training.fit import Metrics, Progress, Save, batches, fit, read_state
 from kerv_cli.training.settings import TrainSettings
-from kerv_cli.training.target import Imitation, lit, vocabulary, waypoints_of
+from kerv_cli.training.target import Imitation, Samples, lit, vocabulary, waypoints_of
 from kerv_cli.worlds.demos.files import DemoEpisode
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -311,3 +312,40 @@ def test_a_target_is_not_said_to_be_trained_in_another_number_format(results):
     words = ["target=nano", "task=drawer-close", "name=half", "runtime.dtype=bfloat16", f"results={results}"]
     assert "remove runtime.dtype" in refusal("train", "target", *words, code=2)
     assert not (results / "artifacts/target/half").exists()
+
+
+def test_padding_of_fast_chunks_does_not_count():
+    """The loss and both shares are those of the tokens up to each chunk's end token, whatever the model says after."""
+    random = np.random.default_rng(0)
+    chunks = np.cumsum(random.normal(0, 0.2, (40, 4, 4)), 1).clip(-1, 1)
+    chunks[::3] = 0.0  # one token and the end
+    actions = replace(ACTIONS, low=(-1.0,) * 4, high=(1.0,) * 4, code=FastCode.learn(chunks))
+    settings = TargetSettings(width=24, heads=2, layers=1, feed_forward=24, chunk=4, observation="state", code="fast")
+    target = CompactTarget(settings, actions, OBSERVATION, vocabulary(SPEC.name), "corner4")
+    count = len(chunks)
+    samples = Samples(
+        steps=torch.arange(count),
+        words=torch.zeros(count, settings.instruction_tokens, dtype=torch.long),
+        proprioception=torch.zeros(count, len(OBSERVATION.proprioception)),
+        states=torch.zeros(count, OBSERVATION.state),
+        frames=None,
+        chunks=torch.from_numpy(chunks).float(),
+        places=torch.zeros(count, len(OBSERVATION.places), 3),
+        episodes=torch.arange(count),
+        tasks=torch.zeros(count, dtype=torch.long),
+    )
+    imitation = Imitation(target, samples, replace(TINY, bf16=False, scene_weight=0.0, held_out=0.5))
+    held = imitation.held_out
+    tokens = imitation.tokens(held)
+    own = torch.tensor([row.tolist().index(actions.end) + 1 for row in tokens])
+    assert own.min() < tokens.shape[1]
+    with torch.no_grad():
+        logits = target.teacher_forced(held.inputs(target.device), tokens)[0]
+    hits = [(logits[i, :n].argmax(-1) == tokens[i, :n]) for i, n in enumerate(own)]
+    assert imitation.validate(target)["token_accuracy"] == pytest.approx(float(torch.cat(hits).float().mean()))
+    indices = torch.arange(len(imitation.training))
+    batch = imitation.training.where(indices)
+    tokens = imitation.tokens(batch)
+    logits = target.teacher_forced(batch.inputs(target.device), tokens)[0].log_softmax(-1)
+    losses = [-logits[i, n, row[n]] for i, row in enumerate(tokens) for n in range(row.tolist().index(actions.end) + 1)]
+    assert float(imitation.loss(indices, 0)[0].detach()) == pytest.approx(float(torch.stack(losses).mean().detach()))

@@ -21,10 +21,10 @@ from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.compact.features import WordTokenizer
 from kerv_cli.targets.compact.target import CompactTarget, save_target
 from kerv_cli.training.demonstrations import PolicyActs, open_demos
-from kerv_cli.training.drafter import train_drafter
+from kerv_cli.training.drafter import plan_drafter
 from kerv_cli.training.fit import batches, identity_of
 from kerv_cli.training.settings import DemosSettings, TrainDrafterSettings, TrainSettings, TrainTargetSettings
-from kerv_cli.training.target import task_weights, train_target
+from kerv_cli.training.target import plan_target, task_weights
 from kerv_cli.worlds import spec_of
 from kerv_cli.worlds.demos.dataset import DemoDataset, DemoEntry
 from kerv_cli.worlds.demos.files import DemoEpisode
@@ -78,7 +78,7 @@ def init_settings(with_old: Path, *overrides: str) -> TrainTargetSettings:
 
 
 def trained(with_old: Path, *overrides: str) -> Path:
-    return train_target(init_settings(with_old, *overrides), Database(with_old))[0]
+    return plan_target(init_settings(with_old, *overrides), Database(with_old)).make()[0]
 
 
 @pytest.mark.bits
@@ -100,7 +100,7 @@ def test_the_weights_belong_to_the_runs_identity_and_their_name_does_not(with_ol
     trained(with_old, "train.init=renamed", "train.steps=5")
     save_old(with_old, 4)
     for other in ("train.init=old", "train.init=null"):
-        with pytest.raises(CheckpointError, match="other settings or data"):
+        with pytest.raises(UsageError, match="other settings or data"):
             trained(with_old, other)
 
 
@@ -136,7 +136,7 @@ def test_what_cannot_be_trained_is_refused(with_old, overrides, says):
 @pytest.mark.parametrize("setting", ["init=old", "colour=0.3", "places=path", "balance=0.5", "closed_loop=2"])
 def test_settings_of_targets_are_refused_for_a_drafter(tmp_path, setting):
     with pytest.raises(UsageError, match=rf"train\.{setting}"):
-        train_drafter(compose("train_drafter", [f"train.{setting}"], TrainDrafterSettings), Database(tmp_path))
+        plan_drafter(compose("train_drafter", [f"train.{setting}"], TrainDrafterSettings), Database(tmp_path)).make()
 
 
 @pytest.mark.parametrize(

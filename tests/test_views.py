@@ -180,7 +180,7 @@ def test_from_recording_to_rollout(tmp_path):
         asked = [f"world.camera.name={camera}", "world.camera.size=32", common[0], common[-1]]
         wrong = kerv("train", "target", "name=wrong", f"demos={name}", *sizes, *steps, *asked, code=1)
         assert f"the policy would be shown {camera}" in wrong.output
-    another = kerv("train", "target", "name=left", "demos=two", *sizes, *steps, *common, code=1)
+    another = kerv("train", "target", "name=left", "demos=two", *sizes, *steps, *common, code=2)
     assert "holds a run with other settings or data" in another.output
     for words in (
         ["train", "drafter", "drafter=early", "policy.target=seen", "demos=one", *steps, common[-1]],

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
+import fcntl
 import functools
 import hashlib
 import itertools
@@ -24,7 +25,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from kerv_cli.base.errors import CheckpointError, StorageError, UsageError
+from kerv_cli.base.errors import CheckpointError, Interrupted, StorageError, UsageError
 
 MOST_TEXT = 2**28
 """Maximum size of a JSON file in bytes. kerv's own files are far smaller."""
@@ -143,6 +144,39 @@ def _exchange(a: Path, b: Path) -> None:
             return
     shutil.rmtree(b)
     os.rename(a, b)
+
+
+@contextlib.contextmanager
+def owned(path: Path, resumes: Callable[[], bool]) -> Iterator[None]:
+    """Hold a lock of the operating system on a new file or folder, and replace what is there once the block has ended.
+
+    If the block fails, what was there comes back. An interrupted one keeps what it has made, to go on from there.
+
+    Args:
+        path: The file or folder that the block makes.
+        resumes: Called with the lock held. It refuses to replace what is there, or returns whether the block goes on
+            with it.
+    """
+    lock, old = path.with_name(f".{path.name}.lock"), temporary_beside(path)
+    with storage_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = lock.open("a")
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UsageError(f"another command is making {path}: wait for it, or choose another name") from None
+        if not resumes() and path.exists():
+            path.rename(old)
+        try:
+            yield
+        except BaseException as error:
+            if old.exists() and not (isinstance(error, Interrupted | KeyboardInterrupt) and path.exists()):
+                remove(path)
+                old.rename(path)
+            raise
+        finally:
+            remove(old)
 
 
 def visible(folder: Path) -> list[Path]:
@@ -327,7 +361,8 @@ def _sha256(path: str, inode: int, size: int, changed: int) -> str:
 def temporary_beside(path: Path) -> Path:
     """Return a new temporary path in the same folder as `path`. Its name contains this machine and process."""
     mark = f"{socket.gethostname().replace('.', '-')}.{os.getpid()}-{secrets.token_hex(4)}"
-    return path.with_name(f".{path.name[:150]}.{mark}.tmp")
+    name = path.name.encode()[:150].decode(errors="ignore")
+    return path.with_name(f".{name}.{mark}.tmp")
 
 
 def is_left_over(path: Path) -> bool:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from kerv_cli.base.config import command_of_a_study
 from kerv_cli.base.errors import StorageError, UsageError
-from kerv_cli.base.files import storage_errors
+from kerv_cli.base.files import storage_errors, visible
 
 PLAIN_NAME = re.compile(r"\w[\w.+-]{0,199}")
 """Pattern of names that can be used for a folder in the results folder: no slash, no leading dot."""
@@ -78,15 +78,9 @@ def artifact_or_path(results: str, kind: str, name: str) -> Path:
 
 
 def check_name(name: str, what: str) -> str:
-    """Check that a name can be used for a folder, and return it.
-
-    Args:
-        name: The name.
-        what: What is named, text for the error message.
-
-    Raises:
-        UsageError: The name does not match PLAIN_NAME.
-    """
+    """Return a name that can be used for a folder. `what` says in the error message what is named."""
+    if len(name.encode()) > 200:
+        raise UsageError(f"{what} '{name[:40]}…' has {len(name.encode())} bytes: at most 200")
     if not PLAIN_NAME.fullmatch(name):
         raise UsageError(
             f"{what} '{name}' must be letters, digits, '_', '-', '+', '.' and begin with a letter or a digit"
@@ -149,6 +143,27 @@ def find_target(results: str, name: str) -> Path:
     names = target_names(results)
     remedies += [f"take one of {', '.join(names)}"] if names else []
     raise UsageError(f"no target '{name}' in {', '.join(map(str, folders))}: {', or '.join(remedies)}")
+
+
+def check_free(path: Path, setting: str, replace: bool) -> None:
+    """Refuse to replace what another command made, unless `replace=true` was typed.
+
+    Args:
+        path: The file or folder to make.
+        setting: The setting that chooses another name, for the error message.
+        replace: Whether `replace=true` was typed.
+    """
+    if not replace and (path.is_file() or visible(path)):
+        raise UsageError(f"{path} is there already: choose another {setting}=NAME, or type replace=true to replace it")
+
+
+def new_target(results: str, name: str) -> Path:
+    """Return the folder of a new target. Names of shipped policies are refused, because they would be shadowed."""
+    folder = artifact(results, "target", name)
+    for policies in (shipped_dir(), results_dir(results) / "pretrained"):
+        if name in RELEASED or (policies / name).is_dir():
+            raise UsageError(f"name={name} is the name of a policy that ships with kerv: choose another name=")
+    return folder
 
 
 def check_not_shipped(path: Path, word: str) -> None:

@@ -59,6 +59,9 @@ class RuntimeSettings:
     executor_options: SlurmOptions = setting(SlurmOptions, "executor=slurm: what to ask of Slurm for each worker")
 
 
+REPLACE = "replace what another command has made under this name"
+
+
 @dataclass(kw_only=True)
 class CommandSettings:
     """Settings of every command."""

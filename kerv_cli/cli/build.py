@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.paths import artifact
+from kerv_cli.base.files import owned
+from kerv_cli.base.paths import check_free, find_target, new_target
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, as_planned, database_of, print_figures
+from kerv_cli.cli.common import AsJson, ShowPlan, database_of, made, print_figures
 from kerv_cli.targets import TargetPart
 from kerv_cli.targets.settings import BuildTargetSettings
 from kerv_cli.training.settings import BuildDatastoreSettings, BuildDrafterSettings
@@ -14,7 +15,7 @@ from kerv_cli.training.settings import BuildDatastoreSettings, BuildDrafterSetti
 @command(
     "build target",
     BuildTargetSettings,
-    keys="grow policy.target target checkpoint name statistics environment check results",
+    keys="grow policy.target target checkpoint name statistics environment check replace results",
     typed={"target": "family", "policy.target": "base"},
 )
 def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
@@ -32,12 +33,25 @@ def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
         raise UsageError(f"family={settings.family}: only {imported} is imported, others are trained")
     from kerv_cli.lab.runs import making
 
-    with making(database_of(settings), "target", artifact(settings.results, "target", settings.name)):
+    folder = new_target(settings.results, settings.name)
+    if settings.grow.width and find_target(settings.results, settings.base).resolve() == folder.resolve():
+        raise UsageError(f"name={settings.name}: a target cannot grow from itself, choose another name=")
+
+    def check() -> bool:
+        check_free(folder, "name", settings.replace)
+        return False
+
+    check()
+    with making(database_of(settings), "target", folder), owned(folder, check):
         folder, figures = importer(settings)
     print_figures("target", figures, folder, as_json)
 
 
-@command("build drafter", BuildDrafterSettings, keys="checkpoint policy.target policy.artifacts positions mask results")
+@command(
+    "build drafter",
+    BuildDrafterSettings,
+    keys="checkpoint policy.target policy.artifacts positions mask replace results",
+)
 def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
     """Import a drafter in the public EAGLE or Spec-VLA layout for a target.
 
@@ -47,20 +61,17 @@ def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
     """
     if not settings.checkpoint:
         raise UsageError("checkpoint=DIR: name the folder of a drafter (config.json, model.safetensors)")
-    from kerv_cli.lab.runs import making
-    from kerv_cli.methods.artifacts import Artifacts
-    from kerv_cli.training.drafter import import_drafter
+    from kerv_cli.training.drafter import plan_import
 
-    folder = Artifacts(settings.results, settings.policy).new("drafter")
-    with making(database_of(settings), "drafter", folder):
-        folder, figures = import_drafter(settings)
+    with made(plan_import(settings), database_of(settings)) as (folder, figures):
+        pass
     print_figures("drafter", figures, folder, as_json)
 
 
 @command(
     "build datastore",
     BuildDatastoreSettings,
-    keys="policy.target policy.artifacts demos task episodes key components half",
+    keys="policy.target policy.artifacts demos task episodes key components half replace",
 )
 def datastore(settings: BuildDatastoreSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Store the demonstrations' action chunks with the target's features as search keys, for drafts by retrieval.
@@ -69,8 +80,9 @@ def datastore(settings: BuildDatastoreSettings, plan: ShowPlan = False, as_json:
         kerv build datastore demos=mt10 policy.artifacts.datastore=mine
         kerv build datastore policy.target=mine demos=mine half=true --plan
     """
-    from kerv_cli.training.datastore import build_datastore
+    from kerv_cli.training.datastore import plan_datastore
 
-    with as_planned(settings, plan, as_json) as (database, begin):
-        folder, store = build_datastore(settings, database, begin)
+    database = database_of(settings)
+    with made(plan_datastore(settings, database), database, plan, as_json) as (folder, store):
+        pass
     print_figures("datastore", {"entries": len(store.vectors), "tasks": len(store.shards)}, folder, as_json)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import ShowPlan, as_planned, print_table
+from kerv_cli.cli.common import ShowPlan, database_of, made, print_table
 from kerv_cli.training.settings import CalibrateSettings
 
 if TYPE_CHECKING:
@@ -26,10 +26,11 @@ def constants(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
         kerv calibrate demos=mt10 policy.artifacts.calibration=mine
         kerv calibrate policy.target=mine demos=mine decodes=20 --plan
     """
-    from kerv_cli.training.calibration import calibrate
+    from kerv_cli.training.calibration import plan_calibration
 
-    with as_planned(settings, plan) as (database, begin):
-        path, calibration, notes = calibrate(settings, database, begin)
+    database = database_of(settings)
+    with made(plan_calibration(settings, database), database, plan) as (path, calibration, notes):
+        pass
     rows: list[tuple[object, ...]] = []
     for name, counts in calibration.demos.tasks.items():
         row = calibration.variability.get(name)

@@ -9,14 +9,14 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import typer
 
+from kerv_cli.base.durations import about
 from kerv_cli.base.errors import Interrupted, KervError, UsageError
 from kerv_cli.base.limits import description
 from kerv_cli.base.settings import CommandSettings
@@ -26,7 +26,9 @@ if TYPE_CHECKING:
 
     from kerv_cli.lab.database import Database
     from kerv_cli.lab.runs import Run
-    from kerv_cli.training.settings import Begin, Stage
+    from kerv_cli.training.settings import Plan
+
+T = TypeVar("T")
 
 ShowPlan = Annotated[bool, typer.Option("--plan", help="Print what would be done and how long it takes, and stop.")]
 
@@ -218,33 +220,21 @@ def database_of(settings: CommandSettings) -> Database:
 
 
 @contextmanager
-def as_planned(
-    settings: CommandSettings, plan: bool = False, as_json: bool = False
-) -> Iterator[tuple[Database, Begin]]:
-    """Open a `with` block that makes an artifact. At the end, store in the database how the command ended.
+def made(plan: Plan[T], database: Database, show: bool = False, as_json: bool = False) -> Iterator[T]:
+    """Do the work of a plan, and yield its result. The database stores how the command ended.
 
-    Args:
-        settings: Settings of the command.
-        plan: Whether to print only what would be made and how long that takes, and then end the command.
-        as_json: Whether to print the plan as JSON.
-
-    Yields:
-        The database of the results folder, and a function that the code in the block calls once the settings are
-        checked. The function writes the command's row in the database. With `plan` it prints the plan instead.
+    With `show`, print only what would be made and how long that takes, and end the command.
     """
     from kerv_cli.lab import runs
     from kerv_cli.lab.command import current_command
 
-    database = database_of(settings)
-    with ExitStack() as stack:
-
-        def begin(kind: str, folder: Path, what: str, units: int) -> Stage:
-            if plan:
-                end_with_plan(f"{what}, {runs.time_of(database, kind, current_command(), units)}", as_json)
-            run = stack.enter_context(runs.making(database, kind, folder))
-            return lambda title: progress_bar(title, run)
-
-        yield database, begin
+    if show:
+        time = runs.time_of(database, plan.kind, current_command(), plan.units)
+        if plan.seconds and time.startswith("time unknown"):
+            time = about(plan.seconds(), "from two steps, measured now")
+        end_with_plan(f"{plan.text}, {time}", as_json)
+    with runs.making(database, plan.kind, plan.folder) as run:
+        yield plan.make(lambda title: progress_bar(title, run))
 
 
 @contextmanager

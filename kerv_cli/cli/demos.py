@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from kerv_cli.base.durations import count
 from kerv_cli.base.errors import Interrupted, UsageError
 from kerv_cli.base.paths import artifact
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import ShowPlan, as_planned, database_of, print_table, progress_bar
+from kerv_cli.cli.common import ShowPlan, database_of, made, print_table, progress_bar
 from kerv_cli.training.settings import DemosSettings
 from kerv_cli.worlds.settings import DemosImportSettings
 
@@ -25,21 +24,14 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
         kerv demos name=mine task=MT10 episodes=100
         kerv demos name=visited policy=vision task=reach --plan
     """
-    from kerv_cli.training.demonstrations import name_of, recording_of
-    from kerv_cli.worlds.demos.recording import check_recording, record
+    from kerv_cli.training.demonstrations import plan_demos
 
-    config, actor = recording_of(settings)
-    config.spec.check_installed()
-    folder = artifact(settings.results, "demos", settings.name or name_of(settings.task))
-    check_recording(config, folder)
-    what = f"{count(len(config.tasks), 'task')} x {count(settings.episodes, 'episode')} -> {folder}"
+    database, planned = database_of(settings), plan_demos(settings)
     try:
-        with as_planned(settings, plan) as (_, begin):
-            stage = begin("demos", folder, what, len(config.tasks) * settings.episodes)
-            with stage("demonstrations") as advance:
-                manifest = record(config, folder, advance, actor)
+        with made(planned, database, plan) as (folder, manifest):
+            pass
     except KeyboardInterrupt:
-        kept = f"finished episodes are kept in {folder}, the same command goes on there"
+        kept = f"finished episodes are kept in {planned.path}, the same command goes on there"
         raise Interrupted(f"interrupted: {kept}") from None
     rows = ((n, len(row.episodes), f"{row.mean_steps:.0f}", len(row.failed_seeds)) for n, row in manifest.tasks.items())
     print_table(("task", "episodes", "mean steps", "failed seeds"), rows, f"demonstrations in {folder}")

@@ -17,7 +17,7 @@ NOT_OF_STEPS = ("for", "steps", "quick")
 @command(
     "prepare",
     PrepareSettings,
-    keys="policy.target for demos task quick steps runtime.device results",
+    keys="policy.target for demos task quick steps replace runtime.device results",
     typed={"for": "methods"},
 )
 def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = False) -> None:

@@ -7,14 +7,14 @@ from pathlib import Path
 import typer
 
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, as_planned, end_with_json, print_figures
+from kerv_cli.cli.common import AsJson, ShowPlan, database_of, end_with_json, made, print_figures
 from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
 
 
 @command(
     "train target",
     TrainTargetSettings,
-    keys="name demos task quick target target.observation train.steps train.init runtime.device",
+    keys="name demos task quick target target.observation train.steps train.init replace runtime.device",
 )
 def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Train a target policy on demonstrations by behaviour cloning.
@@ -25,10 +25,10 @@ def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJso
     """
     typer.echo(f"target {settings.name}: {settings.train.steps} steps", err=True)
     from kerv_cli.report.plots import save_curves
-    from kerv_cli.training.target import train_target
+    from kerv_cli.training.target import plan_target
 
-    with as_planned(settings, plan, as_json) as (database, begin):
-        folder, metrics = train_target(settings, database, begin)
+    database = database_of(settings)
+    with made(plan_target(settings, database), database, plan, as_json) as (folder, metrics):
         curves = save_curves(folder)
     _print(folder, metrics, curves, as_json)
 
@@ -36,7 +36,7 @@ def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJso
 @command(
     "train drafter",
     TrainDrafterSettings,
-    keys="policy.target drafter demos task policy.artifacts train.steps runtime.device",
+    keys="policy.target drafter demos task policy.artifacts train.steps replace runtime.device",
 )
 def drafter(settings: TrainDrafterSettings, plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Train a drafter to imitate a target's greedy decodes. drafter=NAME chooses its kind, such as early.
@@ -47,10 +47,10 @@ def drafter(settings: TrainDrafterSettings, plan: ShowPlan = False, as_json: AsJ
     """
     typer.echo(f"drafter={settings.drafter.kind} of {settings.policy.target}: {settings.train.steps} steps", err=True)
     from kerv_cli.report.plots import save_curves
-    from kerv_cli.training.drafter import train_drafter
+    from kerv_cli.training.drafter import plan_drafter
 
-    with as_planned(settings, plan, as_json) as (database, begin):
-        folder, metrics = train_drafter(settings, database, begin)
+    database = database_of(settings)
+    with made(plan_drafter(settings, database), database, plan, as_json) as (folder, metrics):
         curves = save_curves(folder)
     _print(folder, metrics, curves, as_json)
 

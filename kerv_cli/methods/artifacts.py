@@ -84,11 +84,6 @@ def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str
             raise CheckpointError(f"{what} for {noun} {digest[:12]}, not for {used[kind][:12]}: {again}")
 
 
-def removal(kind: str, path: Path) -> str:
-    """Return the part of an error message that says how to remove the artifact in `path` before a new one is made."""
-    return f"remove it with 'kerv runs rm {kind}/{path.name}'" if path.parent.name == kind else f"move {path} aside"
-
-
 class Artifact(Generic[T]):
     """Base class of the kinds of artifacts, such as drafter, datastore and calibration.
 
@@ -116,14 +111,9 @@ class Artifact(Generic[T]):
         """Return advice for an error message: how to make such an artifact. `words` are further arguments."""
         return f"{self.advice} 'kerv {' '.join((*self.command, *words))}'"
 
-    def anew(self, path: Path, *words: str) -> str:
-        """Return advice for an error message: how to replace the artifact in `path`, made for another target.
-
-        Args:
-            path: Path of the artifact.
-            words: Further arguments of the command that makes the artifact.
-        """
-        return self.again(*words)
+    def anew(self, *words: str) -> str:
+        """Return advice for an error message: how to replace an artifact that was made for another target."""
+        return self.again(*words, "replace=true")
 
     def path(self, results: str, name: str | None, target: Path) -> Path:
         """Return the path of an artifact.
@@ -213,7 +203,7 @@ class Artifact(Generic[T]):
                 normalisation or chunk length.
         """
         description = self.read(path)
-        made, what, again = self.made_for(description), f"the {self.noun} in {path}", self.anew(path)
+        made, what, again = self.made_for(description), f"the {self.noun} in {path}", self.anew()
         made.actions.check_same(target.actions, what, "the target", statistics=True)
         what = f"{what} was {self.made}"
         if made.chunk and made.chunk != target.chunk:
@@ -308,20 +298,20 @@ class Artifacts:
             description = files.checked(path, self.description)
             hashes[kind] = files.digest(path, description)
             what = f"the {files.noun} in {path} was {files.made}"
-            sources.append((files.sources(description), what, self._again(files, path)))
+            sources.append((files.sources(description), what, self._again(files)))
             if use is not None:
                 files.check_use(description, use)
         for hashes_of_sources, what, again in sources:
             check_sources(hashes_of_sources, hashes, what, again)
         return hashes
 
-    def _again(self, files: Artifact[Any], path: Path) -> str:
-        """Return advice for an error message: how to replace the artifact in `path`, with all words of the command."""
+    def _again(self, files: Artifact[Any]) -> str:
+        """Return advice for an error message: how to replace an artifact, with all words of the command."""
         words = [f"policy.target={self.policy.target}"]
         for kind, name in self.policy.artifacts.items():
             if name:
                 words.append(f"policy.artifacts.{kind}={name}")
-        return files.anew(path, *words)
+        return files.anew(*words)
 
     def _making(self, files: Artifact[Any]) -> str:
         """Return the command that makes a missing artifact."""

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.engine.proposer import Proposer
-from kerv_cli.methods.artifacts import Artifact, Artifacts, MadeFor, removal
+from kerv_cli.methods.artifacts import Artifact, Artifacts, MadeFor
 from kerv_cli.methods.context import Context
 from kerv_cli.targets import checkpoint
 from kerv_cli.targets.compact.program import load_compiled
@@ -175,17 +175,6 @@ class TrainableDrafter(Artifact[DrafterDescription]):
             settings: Settings of the proposer.
             context: The context in which the method is built.
         """
-
-    def anew(self, path: Path, *words: str) -> str:
-        """Return advice for an error message: how to replace the drafter in `path`, trained for another target.
-
-        The user must remove the old drafter first, because a training can only be resumed for its own target.
-
-        Args:
-            path: Folder of the drafter.
-            words: Further arguments of the command that trains a drafter.
-        """
-        return f"{removal(self.kind, path)}, then {self.again(*words)}"
 
     def load(self, path: Path, artifacts: Artifacts) -> Any:
         """Load the network with frozen weights, on the target's device and in the target's number format."""

@@ -129,17 +129,11 @@ def keys_of(message: Message) -> str:
 
 
 def text_of(value: object, key: str) -> str:
-    """Return a text that a client sent.
-
-    Args:
-        value: The value to check.
-        key: The value's key in the message, for the error message.
-
-    Raises:
-        UsageError: The value is not a text.
-    """
-    if not isinstance(value, str):
+    """Return the instruction that a client sent under `key`. A missing or empty one is refused."""
+    if not isinstance(value, str | None):
         raise UsageError(f"{key} is {type(value).__name__}, a text is wanted")
+    if not value or not value.strip():
+        raise UsageError(f"no {key}: the message must say what the robot has to do")
     return value
 
 

@@ -38,7 +38,7 @@ def observation_of(interface: Interface, message: Message) -> Observation:
     Raises:
         UsageError: A value is missing, has a wrong size or type, or is not finite. The message names the value.
     """
-    prompt = text_of(message.get(PROMPT, ""), PROMPT)
+    prompt = text_of(message.get(PROMPT), PROMPT)
     images = {}
     for camera in interface.cameras:
         keys = [f"observation/{camera}", *([IMAGE] if len(interface.cameras) == 1 else [])]

@@ -172,7 +172,7 @@ class VlaEval(Conversation):
         """Read a message. `numbers`: proprioception (p,) and simulator state (s,), already checked."""
         images = payload.get("images")
         images = images if isinstance(images, dict) else {}
-        instruction = text_of(payload.get("task_description", ""), "task_description")
+        instruction = text_of(payload.get("task_description"), "task_description")
         frames = {}
         for camera in self.interface.cameras:
             if camera not in images:

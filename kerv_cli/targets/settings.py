@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import choice, number, setting
-from kerv_cli.base.settings import RunSettings
+from kerv_cli.base.settings import REPLACE, RunSettings
 
 
 @dataclass
@@ -72,6 +72,7 @@ class BuildTargetSettings(RunSettings):
     grow: GrowSettings = setting(GrowSettings, "enlarge policy.target to this shape: 60m, 150m, 1b, openvla-7b")
     base: str = setting("mt10-vision", "the policy that is enlarged")
     name: str = setting("openvla", "name of the new folder in <results>/artifacts/target")
+    replace: bool = setting(False, REPLACE)
     statistics: str | None = setting(None, "data set whose action statistics it uses; null: the only one in it")
     environment: str | None = setting(
         None, "environment whose DoFs, control rate and camera it uses; null: OpenVLA's own"

@@ -20,8 +20,10 @@ import numpy as np
 
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import KervError
-from kerv_cli.base.files import read_mapping, write_json
+from kerv_cli.base.files import write_json
+from kerv_cli.base.paths import check_free
 from kerv_cli.base.registry import find
+from kerv_cli.base.runtime import set_up
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.engine.record import MEAN, MEASURES, DecodeRecord, variability
@@ -36,7 +38,7 @@ from kerv_cli.methods.kerv.prediction import Noise, kalman_weights
 from kerv_cli.targets.observations import check_tail, observations_of
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_tasks, demos_for
-from kerv_cli.training.settings import Begin, CalibrateSettings, quietly
+from kerv_cli.training.settings import CalibrateSettings, Plan, Stage
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.files import DemoEpisode
@@ -63,31 +65,16 @@ RATIOS = np.logspace(-3, 3, 49)
 """Grid of the Kalman filter's ratio q / r (process noise to measurement noise), with r = 1."""
 
 
-def calibrate(
-    settings: CalibrateSettings, database: Database, begin: Begin = quietly
-) -> tuple[Path, stored.Calibration, list[str]]:
-    """Measure the sections of a calibration that the settings allow, and write them to its JSON file.
+def plan_calibration(
+    settings: CalibrateSettings, database: Database
+) -> Plan[tuple[Path, stored.Calibration, list[str]]]:
+    """Check what a calibration is measured on. The work measures its sections and writes them to one JSON file.
 
-    The reference levels K_S of the kinematic variability are not measured if `decodes` is 0 or the drafter is missing.
-    Skip levels, the smallest similarities at which verification is skipped, are not measured without a datastore.
-
-    Args:
-        settings: Settings of `kerv calibrate`.
-        database: The database of the results folder.
-        begin: Called once all settings are checked.
-
-    Returns:
-        The path of the JSON file, the calibration, and one line per section that was not measured, with the reason.
-
-    Raises:
-        UsageError: A number is out of range, or a task is unknown. Or the target does not exist, or does not decode
-            token by token. Or the calibration of a shipped policy would be replaced.
-        CheckpointError: The demonstrations do not exist, are of another environment, or hold images of another size
-            than the target takes. Or the datastore is of another target. Or no end-effector path is curved.
-        KervError: No decode of a task compared a draft with the target, so K_S is unknown.
-        StorageError: The disk cannot be written.
+    The reference levels K_S are not measured if `decodes` is 0 or the drafter is missing, the skip levels not without
+    a datastore. The work returns the file's path, the calibration, and a line per section that was not measured.
     """
-    artifacts = Artifacts(settings.results, settings.policy, device=settings.runtime.device)
+    device, _ = set_up(settings.runtime)
+    artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
     target = artifacts.description
     target.check_autoregressive("kerv calibrate", "there is no draft to calibrate")
     settings, dataset = demos_for(settings, target, database)
@@ -96,14 +83,16 @@ def calibrate(
     method = Method.of(RolloutSettings(**{kind: find(kind, name).default for kind, name in DRAFTS.items()}))
     method.check(target)
     missing = [kind for kind in ("drafter", "datastore") if not artifacts.exists(kind)]
-    hashes = artifacts.check({"datastore"} - set(missing))
+    artifacts.check({"datastore"} - set(missing))
+    path = artifacts.new("calibration", adds=settings.complete)
+
+    def check() -> bool:
+        if not settings.complete:
+            check_free(path, "policy.artifacts.calibration", settings.replace)
+        return settings.complete
+
+    check()
     old: stored.Calibration | None = artifacts.load("calibration") if settings.complete else None
-    # a shipped calibration may be completed, and it may get skip levels for a datastore that the user has built
-    path = artifacts.path("calibration")
-    known = read_mapping(path).get("skip") if path.is_file() else None
-    is_named = bool(settings.policy.artifacts.get("datastore"))
-    fits = isinstance(known, dict) and (is_named or known.get("datastore") == hashes.get("datastore"))
-    artifacts.new("calibration", adds=old is not None or ("datastore" in hashes and not fits))
     without = f"; without {' and '.join(missing)}" if missing else ""
     plan = (
         f"predictors fitted on {count(len(chosen), 'demonstration')} of {count(len(tasks), 'task')}; "
@@ -111,45 +100,45 @@ def calibrate(
         f"positions{without}"
     )
 
-    stage = begin("calibration", path.parent, f"{path}: {plan}", 0)
-
-    with stage("reading demonstrations") as progress:
-        past, future, paths, counts = read_windows(
-            dataset, chosen, target.actions, settings.window, target.chunk, progress
+    def work(stage: Stage) -> tuple[Path, stored.Calibration, list[str]]:
+        decoder = skip = None
+        if settings.decodes and "drafter" not in missing:
+            decoder = method.decoder(artifacts.target, artifacts.load)
+        store = None if "datastore" in missing else artifacts.load("datastore")
+        with stage("reading demonstrations") as progress:
+            past, future, paths, counts = read_windows(
+                dataset, chosen, target.actions, settings.window, target.chunk, progress
+            )
+        variability: dict[str, stored.Variability] = {}
+        if decoder:
+            with stage("pre-sampling") as progress:
+                variability = presample(decoder, dataset, chosen, tasks, settings.decodes, progress)
+        if store:
+            with stage("skip levels") as progress:
+                skip = skip_section(store, tasks, settings.epsilon, settings.confidence, progress)
+        with stage("boundary ranges") as progress:
+            boundary = fit_boundary(paths, settings.boundary_windows, old, progress)
+        with stage("fitting the predictors"):
+            noise = fit_filters(past, future)
+        calibration = stored.Calibration(
+            target=MadeFor.of(target),
+            demos=stored.Demonstrations(dataset.sha256, counts),
+            window=settings.window,
+            noise=noise,
+            variability=variability,
+            boundary=boundary,
+            skip=skip,
+            provenance=provenance_of("kerv calibrate", settings, device),
         )
-    variability: dict[str, stored.Variability] = {}
-    notes: list[str] = []
-    if settings.decodes and "drafter" not in missing:
-        decoder = method.decoder(artifacts.target, artifacts.load)
-        with stage("pre-sampling") as progress:
-            variability = presample(decoder, dataset, chosen, tasks, settings.decodes, progress)
-    else:
-        without = ", no drafter" if "drafter" in missing else ""
-        notes.append(f"no reference levels K_S: decodes={settings.decodes}{without}")
-    skip = None
-    if "datastore" not in missing:
-        with stage("skip levels") as progress:
-            skip = skip_section(artifacts.load("datastore"), tasks, settings.epsilon, settings.confidence, progress)
-    if skip is None:
-        notes.append("no skip levels: no datastore of these tasks (kerv build datastore)")
-    with stage("boundary ranges") as progress:
-        boundary = fit_boundary(paths, settings.boundary_windows, old, progress)
-    with stage("fitting the predictors"):
-        noise = fit_filters(past, future)
-    calibration = stored.Calibration(
-        target=MadeFor.of(target),
-        demos=stored.Demonstrations(dataset.sha256, counts),
-        window=settings.window,
-        noise=noise,
-        variability=variability,
-        boundary=boundary,
-        skip=skip,
-        provenance=provenance_of("kerv calibrate", settings, settings.runtime.device),
-    )
-    if old is not None:
-        calibration = completed(old, calibration)
-    write_json(path, asdict(calibration))
-    return path, calibration, notes
+        if old is not None:
+            calibration = completed(old, calibration)
+        write_json(path, asdict(calibration))
+        no_drafter = ", no drafter" if "drafter" in missing else ""
+        notes = [] if decoder else [f"no reference levels K_S: decodes={settings.decodes}{no_drafter}"]
+        notes += [] if skip else ["no skip levels: no datastore of these tasks (kerv build datastore)"]
+        return path, calibration, notes
+
+    return Plan("calibration", path, f"{path}: {plan}", work, check)
 
 
 def presample(

@@ -15,7 +15,8 @@ import torch
 
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.files import read_mapping, sha256_of, visible, write_folder, write_json
+from kerv_cli.base.files import sha256_of, write_folder, write_json
+from kerv_cli.base.paths import check_free
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.spaces import ObservationSpace
 from kerv_cli.lab.database import Database
@@ -24,7 +25,7 @@ from kerv_cli.methods.heisd import datastore as stored
 from kerv_cli.targets.observations import observations_of, observed_steps, prompts_of, read_chunks
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import demos_for
-from kerv_cli.training.settings import Begin, BuildDatastoreSettings, quietly
+from kerv_cli.training.settings import BuildDatastoreSettings, Plan, Stage
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.files import DemoEpisode
 
@@ -32,27 +33,8 @@ BATCH = 128
 """Maximum number of observations that are encoded together."""
 
 
-def build_datastore(
-    settings: BuildDatastoreSettings, database: Database, begin: Begin = quietly
-) -> tuple[Path, stored.Datastore]:
-    """Write a datastore and open it. An older datastore in the same folder is replaced at the end.
-
-    Args:
-        settings: Settings of `kerv build datastore`.
-        database: The database of the results folder.
-        begin: Called once all settings are checked.
-
-    Returns:
-        The folder and the datastore.
-
-    Raises:
-        CheckpointError: The demonstrations do not exist, are of another environment, contain evaluation seeds, have no
-            episode of a task, have too few actions of the expert, or hold images of another size than the target takes.
-        UsageError: The target does not exist, or `key` is empty. Or the folder holds something else than a datastore.
-            Or the datastore of a shipped policy would be replaced.
-        UnknownName: `key` names an unknown part of the prompt.
-        StorageError: The disk cannot be written.
-    """
+def plan_datastore(settings: BuildDatastoreSettings, database: Database) -> Plan[tuple[Path, stored.Datastore]]:
+    """Check the demonstrations of a datastore. The work writes it, and returns its folder and the opened datastore."""
     if not settings.key:
         raise UsageError("key=[]: name at least one part of the prompt: scene, vision, proprioception")
     device, _ = set_up(settings.runtime)
@@ -60,11 +42,12 @@ def build_datastore(
     settings, dataset = demos_for(settings, artifacts.description, database)
     tasks = sorted(resolve_tasks(settings.task or list(dataset.manifest.tasks)))
     folder = artifacts.new("datastore")
-    is_store = (folder / stored.MANIFEST).is_file() and read_mapping(folder / stored.MANIFEST).get(
-        "kind"
-    ) == "datastore"
-    if not is_store and (folder.is_file() or visible(folder)):
-        raise UsageError(f"{folder} exists and is no datastore: give the new one another name")
+
+    def check() -> bool:
+        check_free(folder, "policy.artifacts.datastore", settings.replace)
+        return False
+
+    check()
     chosen: dict[str, list[int]] = {}
     seeds: dict[str, list[int]] = {}
     number = steps = 0
@@ -80,41 +63,43 @@ def build_datastore(
         f"{artifacts.folder}, keys from {' + '.join(settings.key)}"
     )
 
-    stage = begin("datastore", folder, f"{folder}: {plan}", 0)
-    parts: list[dict[str, np.ndarray]] = []
-    shards: dict[str, stored.Shard] = {}
-    rows, target = 0, artifacts.description
-    with stage("encoding demonstrations") as progress:
-        for name, indices in chosen.items():
-            first = rows
-            for index in indices:
-                episode, space = dataset.load(index), dataset.manifest.observation
-                parts.append(entries_of(artifacts.target, episode, space, settings.key))
-                rows += len(parts[-1]["step"])
-                progress(len(parts), number)
-            shards[name] = stored.Shard((first, rows), tuple(seeds[name]))
+    def work(stage: Stage) -> tuple[Path, stored.Datastore]:
+        parts: list[dict[str, np.ndarray]] = []
+        shards: dict[str, stored.Shard] = {}
+        rows, target = 0, artifacts.description
+        with stage("encoding demonstrations") as progress:
+            for name, indices in chosen.items():
+                first = rows
+                for index in indices:
+                    episode, space = dataset.load(index), dataset.manifest.observation
+                    parts.append(entries_of(artifacts.target, episode, space, settings.key))
+                    rows += len(parts[-1]["step"])
+                    progress(len(parts), number)
+                shards[name] = stored.Shard((first, rows), tuple(seeds[name]))
 
-    def write(new: Path) -> None:
-        width = write_files(new, parts, settings)
-        files = [name for name in (stored.PROJECTION, stored.VECTORS, stored.PAYLOAD) if (new / name).exists()]
-        manifest = stored.Manifest(
-            format=2,
-            kind="datastore",
-            key=tuple(settings.key),
-            width=width,
-            rows=rows,
-            chunk=target.chunk,
-            actions=target.actions,
-            target=target.sha256,
-            demos=dataset.sha256,
-            files={name: sha256_of(new / name) for name in files},
-            tasks=shards,
-            provenance=provenance_of("kerv build datastore", settings, device),
-        )
-        write_json(new / stored.MANIFEST, asdict(manifest))
+        def write(new: Path) -> None:
+            width = write_files(new, parts, settings)
+            files = [name for name in (stored.PROJECTION, stored.VECTORS, stored.PAYLOAD) if (new / name).exists()]
+            manifest = stored.Manifest(
+                format=2,
+                kind="datastore",
+                key=tuple(settings.key),
+                width=width,
+                rows=rows,
+                chunk=target.chunk,
+                actions=target.actions,
+                target=target.sha256,
+                demos=dataset.sha256,
+                files={name: sha256_of(new / name) for name in files},
+                tasks=shards,
+                provenance=provenance_of("kerv build datastore", settings, device),
+            )
+            write_json(new / stored.MANIFEST, asdict(manifest))
 
-    write_folder(folder, write)
-    return folder, stored.Datastore.open(folder, target)
+        write_folder(folder, write)
+        return folder, stored.Datastore.open(folder, target)
+
+    return Plan("datastore", folder, f"{folder}: {plan}", work, check)
 
 
 @torch.inference_mode()

@@ -19,11 +19,13 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
+from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.paths import artifact_or_path
+from kerv_cli.base.files import visible
+from kerv_cli.base.paths import artifact, artifact_or_path
+from kerv_cli.base.runtime import device_of, set_up
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.episodes.identity import hash_of
@@ -34,10 +36,10 @@ from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.settings import EXPERT, PolicySettings
 from kerv_cli.targets.checkpoint import TargetDescription
-from kerv_cli.training.settings import DemonstrationSettings, DemosSettings
+from kerv_cli.training.settings import DemonstrationSettings, DemosSettings, Plan, Stage
 from kerv_cli.worlds import resolve_tasks, spec_of, specs, stands_for_tasks
-from kerv_cli.worlds.demos.dataset import DemoDataset
-from kerv_cli.worlds.demos.recording import DemoConfig
+from kerv_cli.worlds.demos.dataset import DemoDataset, DemoManifest
+from kerv_cli.worlds.demos.recording import DemoConfig, check_recording, record
 from kerv_cli.worlds.spec import EnvironmentSpec, World
 from kerv_cli.worlds.views import views_of
 
@@ -289,7 +291,7 @@ class PolicyActs:
         Raises:
             CheckpointError: The policy's weights have changed since the recording began.
         """
-        torch.set_num_threads(1)
+        set_up(self.settings.runtime)
         if _hash(self.settings) != self.sha256:
             raise CheckpointError(
                 f"the policy {self.settings.policy.target} has changed since the recording began: record under another "
@@ -300,12 +302,35 @@ class PolicyActs:
 
 
 def _artifacts(settings: DemosSettings) -> Artifacts:
-    return Artifacts(settings.results, settings.policy, settings.datastore)
+    runtime = settings.runtime
+    return Artifacts(settings.results, settings.policy, settings.datastore, device_of(runtime), runtime.dtype)
 
 
 def _hash(settings: DemosSettings) -> str:
     hashes = _artifacts(settings).check(Method.of(settings).needs)
-    return hash_of([hashes, {kind: asdict(part) for kind, part in settings.parts().items()}, settings.chunk])
+    format = [] if settings.runtime.dtype == "float32" else [settings.runtime.dtype]
+    return hash_of([hashes, {kind: asdict(part) for kind, part in settings.parts().items()}, settings.chunk, *format])
+
+
+def plan_demos(settings: DemosSettings) -> Plan[tuple[Path, DemoManifest]]:
+    """Check a recording. Its work records the episodes that are missing, and returns the folder and its manifest."""
+    config, actor = recording_of(settings)
+    config.spec.check_installed()
+    folder = artifact(settings.results, "demos", settings.name or name_of(settings.task))
+
+    def check() -> bool:
+        if folder.is_dir() and visible(folder) and not (folder / "recording.json").is_file():
+            raise UsageError(f"{folder} holds other demonstrations: choose another name=; demos=A+B joins both")
+        check_recording(config, folder)
+        return True
+
+    def work(stage: Stage) -> tuple[Path, DemoManifest]:
+        with stage("demonstrations") as advance:
+            return folder, record(config, folder, advance, actor)
+
+    check()
+    text = f"{count(len(config.tasks), 'task')} x {count(settings.episodes, 'episode')} -> {folder}"
+    return Plan("demos", folder, text, work, check, len(config.tasks) * settings.episodes)
 
 
 def recording_of(settings: DemosSettings) -> tuple[DemoConfig, PolicyActs | None]:

@@ -9,9 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from kerv_cli.base.paths import check_free
 from kerv_cli.base.registry import ProposerPart, find
 from kerv_cli.base.runtime import set_up
 from kerv_cli.lab.database import Database
+from kerv_cli.lab.runs import command_to_go_on
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.drafters import TrainableDrafter
 from kerv_cli.methods.eagle import DrafterSettings
@@ -20,33 +22,16 @@ from kerv_cli.methods.eagle.public import Convention, read_public
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_tasks, demos_for
-from kerv_cli.training.fit import Metrics, batches, figures_of, fit, identity_of, refuse_other, without_subnormals
-from kerv_cli.training.settings import Begin, BuildDrafterSettings, TrainDrafterSettings, quietly
+from kerv_cli.training.fit import Metrics, batches, figures_of, fit, identity_of, resumes, without_subnormals
+from kerv_cli.training.settings import BuildDrafterSettings, Plan, Stage, TrainDrafterSettings
 from kerv_cli.worlds import resolve_tasks
 
 
-def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Begin = quietly) -> tuple[Path, Metrics]:
-    """Train a drafter. If its folder holds a resume file, continue that training.
+def plan_drafter(settings: TrainDrafterSettings, database: Database) -> Plan[tuple[Path, Metrics]]:
+    """Check the training of a drafter. Its work returns the drafter's folder and the metrics of the best weights.
 
-    The target decodes in the number format `runtime.dtype`. The drafter's own weights are trained in float32.
-
-    Args:
-        settings: Settings of `kerv train drafter`.
-        database: The database of the results folder.
-        begin: Called once all settings are checked.
-
-    Returns:
-        The drafter's folder, and the metrics of the best weights.
-
-    Raises:
-        UnknownName: The kind of drafter or a task does not exist.
-        UsageError: The target does not exist, does not decode token by token, or has tokens that this drafter cannot
-            learn. Or the drafter of a shipped policy would be replaced.
-        CheckpointError: The target is damaged, or the demonstrations are missing or damaged. Or the folder holds
-            another training.
-        KervError: The training diverged.
-        StorageError: The disk cannot be written.
-        Interrupted: The process got Ctrl-C or SIGTERM. The state of the training is saved.
+    The target decodes in the number format `runtime.dtype`. The drafter's own weights are trained in float32. A
+    training that was interrupted goes on.
     """
     drafter: TrainableDrafter = find("drafter", settings.drafter.kind, "drafter.kind").built()
     artifacts, train = Artifacts(settings.results, settings.policy), settings.train
@@ -65,59 +50,68 @@ def train_drafter(settings: TrainDrafterSettings, database: Database, begin: Beg
     if settings.runtime.dtype != "float32":  # left out, so that trainings from before it counted can be resumed
         imitated["dtype"] = settings.runtime.dtype
     identity = identity_of(train, dataset, **imitated)
-    refuse_other(folder, identity, drafter.kind, f"policy.artifacts.{drafter.kind}")
+
+    begun = bool(command_to_go_on(database, drafter.kind, folder))
+
+    def check() -> bool:
+        return resumes(folder, identity, f"policy.artifacts.{drafter.kind}", settings.replace, begun)
+
+    check()
     layers = f"{shape['layers']}-layer " if "layers" in shape else ""
     samples = f", greedy decodes of {shape['samples']} observations" if "samples" in shape else ""
     plan = f"{layers}{drafter.noun} of {artifacts.folder}{samples}, {train.steps} steps of {train.batch}"
 
-    stage = begin(drafter.kind, folder, f"{folder}: {plan}", train.steps)
-    device, dtype = set_up(settings.runtime)
-    provenance = provenance_of("kerv train drafter", settings, device)
-    with without_subnormals():
-        with stage("the target's greedy decodes") as progress:
-            target: Any = load_target(artifacts.folder, device, dtype)[0]
-            examples, held_out = drafter.examples(target, dataset, settings.drafter, train.held_out, progress)
-        torch.manual_seed(train.seed)
-        network: Any = drafter.network(settings.drafter, target)
-        drafter.prepare(network, examples)
-        network.to(target.device)
-        draw = batches(len(examples), train)
+    def work(stage: Stage) -> tuple[Path, Metrics]:
+        device, dtype = set_up(settings.runtime)
+        provenance = provenance_of("kerv train drafter", settings, device)
+        with without_subnormals():
+            with stage("the target's greedy decodes") as progress:
+                target: Any = load_target(artifacts.folder, device, dtype)[0]
+                examples, held_out = drafter.examples(target, dataset, settings.drafter, train.held_out, progress)
+            torch.manual_seed(train.seed)
+            network: Any = drafter.network(settings.drafter, target)
+            drafter.prepare(network, examples)
+            network.to(target.device)
+            draw = batches(len(examples), train)
 
-        def loss(step: int) -> tuple[Tensor, Metrics]:
-            return drafter.loss(network, target, examples.where(draw(step)), step, settings)
+            def loss(step: int) -> tuple[Tensor, Metrics]:
+                return drafter.loss(network, target, examples.where(draw(step)), step, settings)
 
-        @torch.no_grad()
-        def validate(network: Any) -> Metrics:
-            return drafter.validate(network, target, held_out, settings)
+            @torch.no_grad()
+            def validate(network: Any) -> Metrics:
+                return drafter.validate(network, target, held_out, settings)
 
-        def save(network: Any, metrics: Metrics) -> None:
-            made = provenance | figures_of(dataset, network, metrics)
-            drafter.save(folder, network, MadeFor.of(description), made, train.stored, settings=shape)
+            def save(network: Any, metrics: Metrics) -> None:
+                made = provenance | figures_of(dataset, network, metrics)
+                drafter.save(folder, network, MadeFor.of(description), made, train.stored, settings=shape)
 
-        with stage("training the drafter") as progress:
-            return folder, fit(network, loss, validate, save, train, folder, identity, progress)
+            with stage("training the drafter") as progress:
+                return folder, fit(network, loss, validate, save, train, folder, identity, progress)
+
+    return Plan(drafter.kind, folder, f"{folder}: {plan}", work, check, train.steps)
 
 
-def import_drafter(settings: BuildDrafterSettings) -> tuple[Path, dict[str, Any]]:
-    """Run `kerv build drafter`: check that a published drafter fits a target, and copy it into the results folder.
-
-    Returns:
-        The drafter's folder, and facts to print: numbers of parameters and layers, and the conventions `positions` and
-        `mask`.
-
-    Raises:
-        UsageError: The target does not exist. Or the drafter of a shipped policy would be replaced.
-        CheckpointError: The target is damaged. Or the drafter is incomplete, damaged, pickled or of another width.
-    """
+def plan_import(settings: BuildDrafterSettings) -> Plan[tuple[Path, dict[str, Any]]]:
+    """Check that a published drafter fits a target. The work copies it, and returns its folder and facts to print."""
     convention = Convention(settings.positions, settings.mask)
     device, _ = set_up(settings.runtime)
     artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
-    target: Any = artifacts.target
-    network = read_public(Path(settings.checkpoint).expanduser(), target, convention)
-    folder, layers = artifacts.new(EagleDrafter.kind), network.shape.language.num_hidden_layers
+    folder = artifacts.new(EagleDrafter.kind)
+
+    def check() -> bool:
+        check_free(folder, "policy.artifacts.drafter", settings.replace)
+        return False
+
+    check()
+    network = read_public(Path(settings.checkpoint).expanduser(), artifacts.target, convention)
+    layers = network.shape.language.num_hidden_layers
     figures = {"parameters": sum(tensor.numel() for tensor in network.parameters())}
     provenance = provenance_of("kerv build drafter", settings, device, **figures)
     shapes = asdict(DrafterSettings(kind="public", layers=layers))
     made_for = MadeFor.of(artifacts.description)
-    EagleDrafter().save(folder, network, made_for, provenance, settings=shapes, public=asdict(network.shape))
-    return folder, {**figures, "layers": layers, **asdict(convention)}
+
+    def work(stage: Stage) -> tuple[Path, dict[str, Any]]:
+        EagleDrafter().save(folder, network, made_for, provenance, settings=shapes, public=asdict(network.shape))
+        return folder, {**figures, "layers": layers, **asdict(convention)}
+
+    return Plan(EagleDrafter.kind, folder, str(folder), work, check)

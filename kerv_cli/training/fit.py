@@ -26,11 +26,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from kerv_cli.base.errors import CheckpointError, Interrupted, KervError
+from kerv_cli.base.errors import CheckpointError, Interrupted, KervError, UsageError
 from kerv_cli.base.files import write_bytes, write_if_changed
-from kerv_cli.base.paths import RESUME
+from kerv_cli.base.paths import RESUME, check_free
 from kerv_cli.episodes.identity import hash_of
-from kerv_cli.methods.artifacts import removal
 from kerv_cli.training.settings import TrainSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
@@ -329,26 +328,28 @@ def identity_of(train: TrainSettings, dataset: DemoDataset, **own: Any) -> str:
     return hash_of({"train": counted, "demos": dataset.sha256, **own})
 
 
-def refuse_other(folder: Path, identity: str, kind: str, setting: str) -> None:
-    """Refuse a folder that holds a training with other settings or data.
+def resumes(folder: Path, identity: str, setting: str, replace: bool, begun: bool) -> bool:
+    """Return whether the folder holds this training, to go on with. Refuse what else it holds, unless `replace`.
 
     Args:
         folder: The folder.
         identity: Result of `identity_of`.
-        kind: Kind of the trained artifact, for the error message.
         setting: The setting that names the folder, for the error message.
-
-    Raises:
-        CheckpointError: The folder holds another training.
+        replace: Whether `replace=true` was typed.
+        begun: Whether the database says that the command which made the folder's content has not ended well.
     """
     try:
         stored = torch.load(folder / RESUME, "cpu", mmap=True, weights_only=True)["identity"]
+    except FileNotFoundError:
+        check_free(folder, setting, replace or begun)
+        return False
     except _UNREADABLE:
-        return
-    if stored != identity:
-        raise CheckpointError(
-            f"{folder} holds a run with other settings or data: choose another {setting}=, or {removal(kind, folder)}"
+        return not replace  # reading the state then says what is damaged
+    if stored != identity and not replace:
+        raise UsageError(
+            f"{folder} holds a run with other settings or data: choose another {setting}=, or type replace=true"
         )
+    return bool(stored == identity)
 
 
 def read_state(path: Path) -> dict[str, Any]:

@@ -13,13 +13,13 @@ from kerv_cli.catalogue.entries import artifact_entry
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import command_to_go_on
-from kerv_cli.methods.artifacts import Artifacts, kind_of, removal
+from kerv_cli.methods.artifacts import Artifacts, kind_of
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.drafters import TrainableDrafter
 from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.training.settings import PrepareSettings, TrainDrafterSettings
 
-THERE, MISSING = "there", "missing"
+THERE, MISSING, INCOMPLETE = "there", "missing", "incomplete"
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class Step:
 
     Attributes:
         kind: Kind of the artifact, such as `drafter` or `datastore`.
-        state: `there`, `missing`, `unfinished`, `of other artifacts` (it was made from artifacts that have been
-            replaced since) or, while it trains, `step 300 of 4000`.
+        state: `there`, `missing`, `unfinished`, `incomplete` (a calibration without some numbers), `of other artifacts`
+            (it was made from artifacts that have been replaced since) or, while it trains, `step 300 of 4000`.
         command: Command-line arguments after `kerv` that make the artifact, without the arguments that all steps share.
         steps: Number of optimisation steps. 0 if the artifact is made without training.
     """
@@ -65,7 +65,10 @@ def plan(settings: PrepareSettings, database: Database) -> list[Step]:
             if settings.steps:
                 command = (*command, f"train.steps={settings.steps}")
             number = compose("train_drafter", command[2:], TrainDrafterSettings).train.steps
-        steps.append(Step(kind, _state(artifacts, database, kind, kinds), command, number))
+        state = _state(artifacts, database, kind, kinds, settings.replace)
+        if state == INCOMPLETE:
+            command = (*command, "complete=true")
+        steps.append(Step(kind, state, command, number))
     if any(step.state != THERE for step in steps):
         demos_for(settings, description, database)
     return steps
@@ -92,19 +95,8 @@ def needs(methods: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(kind for kind in possible if kind_of(kind).command)
 
 
-def _state(artifacts: Artifacts, database: Database, kind: str, kinds: Sequence[str]) -> str:
-    """Return the state of an artifact: `there`, `missing`, `unfinished`, `of other artifacts` or `step 300 of 4000`.
-
-    Args:
-        artifacts: The artifacts of the policy.
-        database: The database of the results folder.
-        kind: Kind of the artifact.
-        kinds: All kinds that the methods need, in the order in which they are made.
-
-    Raises:
-        CheckpointError: The artifact is a trained drafter that belongs to another target or was made from other
-            artifacts.
-    """
+def _state(artifacts: Artifacts, database: Database, kind: str, kinds: Sequence[str], replace: bool) -> str:
+    """Return the state of an artifact, see `Step`. One of other artifacts is refused unless `replace`."""
     files, path = kind_of(kind), artifacts.path(kind)
     if not artifacts.exists(kind):
         return MISSING
@@ -113,11 +105,12 @@ def _state(artifacts: Artifacts, database: Database, kind: str, kinds: Sequence[
         present = [one for one in kinds if artifacts.exists(one)]
         artifacts.check(present[: present.index(kind) + 1])
     except CheckpointError as error:
-        if isinstance(files, TrainableDrafter):
-            raise CheckpointError(f"{str(error).split(': ')[0]}: {removal(kind, path)}") from error
+        if not replace:
+            remedy = f"type replace=true, or name another by policy.artifacts.{kind}="
+            raise CheckpointError(f"{str(error).split(': ')[0]}: {remedy}") from error
         return "of other artifacts"
     if not files.is_complete(described, kinds):
-        return MISSING
+        return INCOMPLETE
     state = artifact_entry(path, kind).state if isinstance(files, TrainableDrafter) else THERE
     if state == "complete" and command_to_go_on(database, kind, path):
         return "unfinished"  # e.g. the disk was full before the last files were written

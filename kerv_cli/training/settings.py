@@ -6,15 +6,18 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from kerv_cli.base.errors import UsageError
+from kerv_cli.base.files import owned
 from kerv_cli.base.limits import choice, limits, number, setting
-from kerv_cli.base.settings import RunSettings, TaskSettings, chosen
+from kerv_cli.base.settings import REPLACE, RunSettings, TaskSettings, chosen
 from kerv_cli.episodes.settings import DEFAULT_TASKS
 from kerv_cli.methods.settings import POLICY, MethodSettings, PolicySettings
 from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.worlds.settings import WorldSettings
+
+T = TypeVar("T")
 
 DEMOS = "name of the demonstrations"
 QUICK = "a first policy in minutes: adds the settings in conf/quick.yaml"
@@ -24,18 +27,44 @@ FIRST_EPISODES = "episodes used per task, lowest seeds first; 0: all"
 Stage = Callable[[str], AbstractContextManager[Callable[..., None]]]
 """Takes the title of a stage of the work. Returns a context manager that yields a progress function (done, total)."""
 
-Begin = Callable[[str, Path, str, int], Stage]
-"""Called once all settings are checked, before the work begins.
 
-It takes the kind and the folder of the artifact, the line that `--plan` prints, and the number of optimisation steps or
-episodes (0 if unknown). If `--plan` was typed, the function that a command passes here prints that line and ends the
-command. Otherwise it notes in the database that the work began.
-"""
+def quietly(title: str) -> AbstractContextManager[Callable[..., None]]:
+    """Show no progress of a stage."""
+    return nullcontext(lambda *done: None)
 
 
-def quietly(kind: str, folder: Path, plan: str, units: int) -> Stage:
-    """Begin work on an artifact without a row in the database, and show no progress. The default for `Begin`."""
-    return lambda title: nullcontext(lambda *done: None)
+@dataclass(frozen=True)
+class Plan(Generic[T]):
+    """Work on an artifact whose settings are checked. Nothing is made until `make` is called.
+
+    Attributes:
+        kind: Kind of the artifact.
+        path: Its folder; for a calibration its file.
+        text: What would be made, for `--plan`.
+        work: Function that makes the artifact, and shows its stages.
+        check: Called again before the work. It refuses to replace what is there, or returns whether the work goes on
+            with it.
+        units: Number of optimisation steps or episodes. 0 if unknown.
+        seconds: Measures how long the work takes, for `--plan` on a machine that has done nothing like it.
+    """
+
+    kind: str
+    path: Path
+    text: str
+    work: Callable[[Stage], T]
+    check: Callable[[], bool]
+    units: int = 0
+    seconds: Callable[[], float] | None = None
+
+    @property
+    def folder(self) -> Path:
+        """Folder whose name the database stores."""
+        return self.path.parent if self.kind == "calibration" else self.path
+
+    def make(self, stage: Stage = quietly) -> T:
+        """Make the artifact while no other command can."""
+        with owned(self.path, self.check):
+            return self.work(stage)
 
 
 @dataclass
@@ -78,7 +107,8 @@ class TrainTargetSettings(TaskSettings):
 
     groups: ClassVar = {"target": "small", "train": "target", "world": "default", "runtime": "auto"}
 
-    name: str = setting("mt10-vision", "name of the new folder in <results>/artifacts/target")
+    name: str = setting("mine", "name of the new folder in <results>/artifacts/target")
+    replace: bool = setting(False, REPLACE)
     task: list[str] = setting([], "tasks and suites; empty: all tasks of the demonstrations")
     demos: str = setting("", f"{DEMOS}; empty: the name that `kerv demos` gives to these tasks")
     quick: bool = setting(False, QUICK)
@@ -115,6 +145,7 @@ class DemonstrationSettings(TaskSettings):
 
     policy: PolicySettings = setting(PolicySettings, POLICY)
     demos: str = setting("", f"{DEMOS}; empty: the ones that the target was trained on")
+    replace: bool = setting(False, REPLACE)
 
 
 @dataclass
@@ -163,6 +194,7 @@ class BuildDrafterSettings(RunSettings):
 
     policy: PolicySettings = setting(PolicySettings, POLICY)
     checkpoint: str = setting("", "folder of the published drafter, with config.json and model.safetensors")
+    replace: bool = setting(False, REPLACE)
     positions: str = choice(
         "sequence", "sequence", "text", help="text: vision tokens get no position number (docs/methods.md §2.2)"
     )
@@ -195,7 +227,7 @@ class CalibrateSettings(DemonstrationSettings):
     """
 
     episodes: int = number(0, 0, 100_000, help=FIRST_EPISODES)
-    window: int = number(10, 4, 10_000, help="control steps of history that the predictors see")
+    window: int = number(10, 4, 10, help="control steps of history that the predictors see; an episode keeps 10")
     epsilon: float = number(
         0.1, above=0, most=1e6, help="verify-skip: largest mean absolute error of a good chunk, normalised units"
     )

@@ -25,21 +25,23 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from kerv_cli.base.codes import CODES, FastCode
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.paths import artifact, find_target
+from kerv_cli.base.paths import find_target, new_target
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.spaces import ActionSpace, Place
+from kerv_cli.engine.stopwatch import Stopwatch
 from kerv_cli.episodes.runner import success_of
 from kerv_cli.lab.database import Database
+from kerv_cli.lab.runs import command_to_go_on
 from kerv_cli.targets.checkpoint import TargetDescription, load_target, read_target
 from kerv_cli.targets.compact.features import WordTokenizer, places_of
 from kerv_cli.targets.compact.target import CompactTarget, save_target
-from kerv_cli.targets.losses import labels_of, position_loss, token_loss
+from kerv_cli.targets.losses import labels_of, position_loss, token_loss, within_chunk
 from kerv_cli.targets.observations import Observations, read_chunks, read_observations, split
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.training.demonstrations import check_spaces, check_tasks, name_of, open_demos, seen_by
-from kerv_cli.training.fit import Metrics, batches, figures_of, fit, identity_of, refuse_other, without_subnormals
-from kerv_cli.training.settings import Begin, TrainSettings, TrainTargetSettings, quietly, refuse_unused
+from kerv_cli.training.fit import Metrics, batches, figures_of, fit, identity_of, resumes, without_subnormals
+from kerv_cli.training.settings import Plan, Stage, TrainSettings, TrainTargetSettings, refuse_unused
 from kerv_cli.worlds import resolve_tasks, settled, spec_of, specs
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.files import DemoEpisode
@@ -51,30 +53,19 @@ WITHIN = 9
 WAYPOINTS = (Place("waypoint 1", 0), Place("waypoint 2", 0))
 """Positions that a policy estimates if its demonstrations hold no object positions: where the hand will be when the
 gripper next changes, and at the end of the episode. No state contains them, so their index 0 is never used."""
+FEW = 4
+"""Episodes on which `--plan` measures the time of a step."""
 VALIDATED = 2048
 """Maximum number of samples in a validation."""
 
 
-def train_target(settings: TrainTargetSettings, database: Database, begin: Begin = quietly) -> tuple[Path, Metrics]:
-    """Train a compact policy. If its folder holds a resume file, continue that training.
+def plan_target(settings: TrainTargetSettings, database: Database) -> Plan[tuple[Path, Metrics]]:
+    """Check a training of a compact policy. Its work returns the target's folder and the metrics of the best weights.
 
-    Args:
-        settings: Settings of `kerv train target`. This function fills in `demos`, `task` and `train.places`.
-        database: The database of the results folder.
-        begin: Called once all settings are checked.
-
-    Returns:
-        The target's folder, and the metrics of the best weights.
-
-    Raises:
-        UsageError: Some settings contradict each other, or the target `train.init` does not exist.
-        CheckpointError: The demonstrations are missing or damaged, or have another environment, camera or other tasks.
-            Or the target `train.init` is damaged. Or the folder holds another training.
-        KervError: The training diverged.
-        StorageError: The disk cannot be written.
-        Interrupted: The process got Ctrl-C or SIGTERM. The state of the training is saved.
+    This function fills in `settings.demos`, `settings.task` and `settings.train.places`. A training that was
+    interrupted goes on.
     """
-    folder, train = artifact(settings.results, "target", settings.name), settings.train
+    folder, train = new_target(settings.results, settings.name), settings.train
     refuse_contradictions(settings)
     settings.demos = settings.demos or name_of(settings.task)
     dataset = open_demos(database, settings.demos, settings.task)
@@ -94,8 +85,13 @@ def train_target(settings: TrainTargetSettings, database: Database, begin: Begin
     if settings.target.code == "bins":  # left out, so that trainings from before there were codes can be resumed
         del shapes["code"]
     identity = identity_of(train, dataset, target=shapes, tasks=tasks, views=dataset.views, **origin)
-    refuse_other(folder, identity, "target", "name")
 
+    begun = bool(command_to_go_on(database, "target", folder))
+
+    def check() -> bool:
+        return resumes(folder, identity, "name", settings.replace, begun)
+
+    check()
     episodes = len(dataset.of_tasks(*tasks))
     start = f", starting from {init}" if init else ""
     plan = (
@@ -103,27 +99,43 @@ def train_target(settings: TrainTargetSettings, database: Database, begin: Begin
         f"{count(len(tasks), 'task')}, {count(train.steps, 'step')} of {train.batch} samples{start}"
     )
 
-    stage = begin("target", folder, f"{folder}: {plan}", train.steps)
-    device, _ = set_up(settings.runtime)
-    provenance = provenance_of("kerv train target", settings, device) | origin
-    with without_subnormals():
-        with stage("reading demonstrations") as progress:
-            target, samples = load_training(settings, dataset, tasks, init, world.camera.name, progress)
-        seeds = spec.seeds.selection[: train.closed_loop]
-        success = functools.partial(success_of, tasks=tasks, seeds=seeds, settings=world) if seeds else None
-        imitation = Imitation(target.to(device), samples, train, success)
+    def work(stage: Stage) -> tuple[Path, Metrics]:
+        device, _ = set_up(settings.runtime)
+        provenance = provenance_of("kerv train target", settings, device) | origin
+        with without_subnormals():
+            with stage("reading demonstrations") as progress:
+                target, samples = load_training(settings, dataset, tasks, init, world.camera.name, progress)
+            seeds = spec.seeds.selection[: train.closed_loop]
+            success = functools.partial(success_of, tasks=tasks, seeds=seeds, settings=world) if seeds else None
+            imitation = Imitation(target.to(device), samples, train, success)
+            draw = batches(len(imitation.training), train, imitation.weights)
+            states = functools.cache(lambda: state_range(dataset))
+
+            def loss(step: int) -> tuple[Tensor, Metrics]:
+                return imitation.loss(draw(step), step)
+
+            def save(target: CompactTarget, metrics: Metrics) -> None:
+                made = provenance | figures_of(dataset, target, metrics)
+                save_target(folder, target, dataset.manifest.environment, made, train.stored, states())
+
+            with stage("training the target") as progress:
+                return folder, fit(target, loss, imitation.validate, save, train, folder, identity, progress)
+
+    def seconds() -> float:
+        device, _ = set_up(settings.runtime)
+        few = replace(dataset, episodes=[dataset.episodes[index] for index in dataset.of_tasks(tasks[0])[:FEW]])
+        target, samples = load_training(settings, few, tasks[:1], init, world.camera.name, lambda done, total: None)
+        imitation = Imitation(target.to(device), samples, train)
         draw = batches(len(imitation.training), train, imitation.weights)
-        states = functools.cache(lambda: state_range(dataset))
+        times = []
+        with without_subnormals():
+            for step in range(train.scene_steps, train.scene_steps + 3):
+                clock = Stopwatch(torch.device(device))
+                imitation.loss(draw(step), step)[0].backward()
+                times.append(clock.stop())
+        return train.steps * min(times[1:])
 
-        def loss(step: int) -> tuple[Tensor, Metrics]:
-            return imitation.loss(draw(step), step)
-
-        def save(target: CompactTarget, metrics: Metrics) -> None:
-            made = provenance | figures_of(dataset, target, metrics)
-            save_target(folder, target, dataset.manifest.environment, made, train.stored, states())
-
-        with stage("training the target") as progress:
-            return folder, fit(target, loss, imitation.validate, save, train, folder, identity, progress)
+    return Plan("target", folder, f"{folder}: {plan}", work, check, train.steps, seconds)
 
 
 def refuse_contradictions(settings: TrainTargetSettings) -> None:
@@ -442,7 +454,8 @@ class Imitation:
                 return loss, {"position_loss": float(loss.detach())}
             tokens = self.tokens(batch)
             logits, positions = self.module.teacher_forced(inputs, tokens)
-            loss = token_loss(logits, tokens, self.labels)
+            end = self.module.actions.end
+            loss = token_loss(logits, tokens, self.labels, None if end is None else within_chunk(tokens, end))
             metrics = {"token_loss": float(loss.detach())}
             if self.learns_places:
                 of_places = position_loss(positions, places)
@@ -466,7 +479,7 @@ class Imitation:
             tokens = self.tokens(batch)
             logits, positions = module.teacher_forced(batch.inputs(self.device), tokens)
             guess = logits.argmax(-1)
-            distances.append((guess - tokens).abs().flatten())
+            distances.append((guess - tokens).abs()[within_chunk(tokens, actions.end)])
             for guessed, expert in zip(guess.tolist(), tokens.tolist(), strict=True):
                 values = actions.chunk_values(guessed, module.chunk)
                 gaps.append(np.abs(values - actions.chunk_values(expert, module.chunk)))
