@@ -5,7 +5,6 @@ An episode file is a safetensors file with lossless PNG images (docs/formats.md)
 
 from __future__ import annotations
 
-import contextlib
 import io
 import json
 import os
@@ -243,87 +242,24 @@ def encode_png(frame: NDArray[np.uint8], level: int = 6) -> bytes:
 
 MOST_EXPANDED = 2**30
 """Largest size of a table in memory, in bytes."""
-_BATCH = 1024  # rows
-_BATCH_BYTES = 2**26  # of text and bytes that the file stores once
-_LEAST_ROW = 64  # bytes: a row counts as at least this large
-_WIDTHS = {"BOOLEAN": 1, "INT32": 4, "FLOAT": 4, "INT64": 8, "DOUBLE": 8, "INT96": 12}
 
 
-@contextlib.contextmanager
-def memory_limit(size: int) -> Iterator[None]:
-    """Let this process take at most `size` more bytes of memory inside the `with` block.
-
-    A file of unknown origin may need more memory than it declares. Outside Linux this does nothing.
-
-    Raises:
-        MemoryError: The code inside the block needs more memory.
-    """
-    status = Path("/proc/self/statm")
-    if not status.is_file():
-        yield
-        return
-    import resource
-
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    most = int(status.read_text().split()[0]) * resource.getpagesize() + size
-    resource.setrlimit(resource.RLIMIT_AS, (most if soft < 0 else min(most, soft), hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-
-
-def foreign_table(source: Path | bytes, columns: Sequence[str] = (), most: int = 0) -> pa.Table:
-    """Read a table from a Parquet file of any origin, part by part, so that its size can be limited.
+def foreign_table(source: Path | bytes, columns: Sequence[str] = ()) -> pa.Table:
+    """Read a table from a Parquet file that another program wrote. It may be small on disk and huge in memory.
 
     Args:
         source: The file's path or its bytes.
-        columns: Names of the columns to read. Names that the file lacks are ignored. If empty, read all
-            columns.
-        most: Largest size of all rows in memory, in bytes. 0 stands for MOST_EXPANDED.
-
-    Raises:
-        OSError: The file is missing or is no Parquet file.
-        ValueError: The file is damaged, or takes more than `most` bytes in memory.
+        columns: Names of the columns to read. Names that the file lacks are ignored. If empty, read all columns.
     """
-    total, most = 0, most or MOST_EXPANDED
-    name = "a table" if isinstance(source, bytes) else str(source)
-    too_large = ValueError(f"{name} expands to more than {most // 2**20} MiB in memory: split it")
+    total, name = 0, "a table" if isinstance(source, bytes) else str(source)
     with pq.ParquetFile(io.BytesIO(source) if isinstance(source, bytes) else regular(source)) as file:
         chosen = [column for column in file.schema_arrow.names if not columns or column in columns]
         schema = pa.schema([file.schema_arrow.field(column) for column in chosen], file.schema_arrow.metadata)
-        largest = 1
-        for group in range(file.num_row_groups):
-            size, text = _expanded(file.metadata, group, chosen)
-            largest = max(largest, text)
-            if size > most:
-                raise too_large
-        # a cell of text can repeat: it is at most as large as its row group in the file
-        rows = max(1, min(_BATCH, min(most, _BATCH_BYTES) // largest))
         batches = []
-        # not pyarrow's dataset scanner, which would expand whole row groups before the total can be checked
-        for batch in file.iter_batches(rows, None, chosen, use_threads=False):
+        # few rows at a time, because a file expands as it is read
+        for batch in file.iter_batches(256, None, chosen, use_threads=False):
             total += batch.nbytes
-            if total > most:
-                raise too_large
+            if total > MOST_EXPANDED:
+                raise ValueError(f"{name} expands to more than {MOST_EXPANDED // 2**20} MiB in memory: split it")
             batches.append(batch)
     return pa.Table.from_batches(batches, schema)
-
-
-def _expanded(metadata: pq.FileMetaData, group: int, columns: Sequence[str]) -> tuple[int, int]:
-    """Estimate from the file's metadata how much memory some columns of a row group take.
-
-    Returns:
-        size: Upper estimate for all these columns, in bytes. Repeated text counts once, unless it is in lists.
-        text: Estimate for the columns with text or binary data, in bytes. Repeated text counts once. At least 1.
-    """
-    chunks, rows = metadata.row_group(group), metadata.row_group(group).num_rows
-    total, text = _LEAST_ROW * rows, 1
-    for number in range(chunks.num_columns):
-        chunk = chunks.column(number)
-        if f"{chunk.path_in_schema}.".startswith(tuple(f"{name}." for name in columns)):  # names may have dots
-            listed = max(1, chunk.total_uncompressed_size if chunk.num_values > rows else 1)
-            fixed = _WIDTHS.get(chunk.physical_type, max(0, metadata.schema.column(number).length))
-            text += 0 if fixed else chunk.total_uncompressed_size
-            total += max(chunk.total_uncompressed_size, chunk.num_values * (fixed or listed))
-    return total, text
