@@ -28,7 +28,7 @@ from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.paths import find_target, new_target
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.spaces import ActionSpace, Place
-from kerv_cli.engine.stopwatch import Stopwatch
+from kerv_cli.engine.decoder import Stopwatch
 from kerv_cli.episodes.runner import success_of
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import command_to_go_on
