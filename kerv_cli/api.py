@@ -27,7 +27,7 @@ from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import ROLLOUT
 from kerv_cli.lab.store import Study as StoredStudy
 from kerv_cli.lab.study import plan, run
-from kerv_cli.report.measures import Row, averaged, frame_of
+from kerv_cli.report.measures import Row
 from kerv_cli.report.report import report as write_reports
 from kerv_cli.report.tables import load_study as load_data
 from kerv_cli.report.viewing import save_recording
@@ -74,9 +74,8 @@ class Study:
         data = load_data(self.store)
         if table == "episodes":
             return data.episodes
-        if table == "tasks":
-            return data.per_task
-        return frame_of(averaged(data.results))
+        results = data.task_results if table == "tasks" else data.results
+        return pd.DataFrame([row.columns() for row in results])
 
     def episodes(self) -> list[Row]:
         """Return the rows of the table `episodes` as dictionaries. It raises the same errors as `to_pandas`."""
@@ -84,7 +83,7 @@ class Study:
         return rows
 
     def report(self) -> list[Path]:
-        """Write the tables, plots and page of a sweep, as `kerv report` does. Return their paths.
+        """Write the tables and page of a sweep, as `kerv report` does. Return their paths.
 
         Raises:
             UsageError: The study is a rollout, which has no report.

@@ -23,14 +23,12 @@ _MODULES = re.compile(r"(?<=<!-- modules -->\n).*(?=<!-- /modules -->)", re.DOTA
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Adds the pages and plots to those that mkdocs found."""
+    """Adds the pages to those that mkdocs found."""
     from mkdocs.structure.files import File
 
     for page in PAGES:
         files.append(File.generated(config, page, content=page_of(page)))
     files.append(File.generated(config, "reference.md", content=reference()))
-    for plot in sorted((ROOT / "results/plots").glob("*.png")):
-        files.append(File.generated(config, f"plots/{plot.name}", abs_src_path=str(plot)))
     for path in sorted(set(re.findall(r"\]\(\.\./(kerv_cli/[^)]+)\)", (ROOT / "docs/layout.md").read_text("utf-8")))):
         files.append(File.generated(config, path, abs_src_path=str(ROOT / path)))
     return files

@@ -1,11 +1,14 @@
 """Fills the figures of Markdown pages from the committed tables: `scripts/figures.py PAGE…`, `--check` changes nothing.
 
+`scripts/figures.py publish STUDY…` copies the tables of these studies, which `kerv report` wrote, to where they are
+committed.
+
     <!-- table main: setting success speedup -->      becomes a table with these columns, a row per setting
     <!-- /table -->
     <!-- figure main one_pass speedup -->2.04 (1.97–2.11)<!-- /figure -->      one number within a sentence
 
-A study's name is that of `results/tables/<study>.csv`. Behind it `macro` takes the average over difficulty groups
-instead of tasks, and `only=a,b` takes these settings, which are written with `_` for a space. A column `NAME@OTHER`
+A study's name is that of `results/tables/<study>.csv`. Behind it `only=a,b` takes these settings, which are written
+with `_` for a space. A column `NAME@OTHER`
 is that of the same setting in the table OTHER.csv, or priced for the machine OTHER, from `<study>_on.csv`. Behind a
 column, `=TITLE` is its heading, with `_` for a space.
 """
@@ -16,13 +19,16 @@ import csv
 import functools
 import json
 import re
+import shutil
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 TABLES = Path(__file__).resolve().parent.parent / "results" / "tables"
+WRITTEN = TABLES.parent / "report" / "tables"
+_POOLED = "micro over tasks"
 _TABLE = re.compile(r"(<!-- table (\S+)((?: \S+)*?): ([^>]*?) -->\n)(.*?)(<!-- /table -->)", re.DOTALL)
-_FIGURE = re.compile(r"(<!-- figure (\S+)( macro)? (\S+) (\S+) -->)(.*?)(<!-- /figure -->)", re.DOTALL)
+_FIGURE = re.compile(r"(<!-- figure (\S+) (\S+) (\S+) -->)(.*?)(<!-- /figure -->)", re.DOTALL)
 
 Row = Mapping[str, str]
 
@@ -32,27 +38,35 @@ class BadReference(Exception):
 
 
 @functools.cache
-def table_of(study: str, macro: bool) -> tuple[dict[str, str], ...]:
-    """The rows of one averaging of a study's table; all rows of a table without averaging."""
+def table_of(study: str) -> tuple[dict[str, str], ...]:
+    """The rows of a study's table. Of a table with several ways of averaging, those that pool all tasks."""
     path = TABLES / f"{study}.csv"
     if not path.is_file():
         raise BadReference(f"no table {path.name} in {TABLES}")
     with path.open(newline="", encoding="utf-8") as file:
-        rows = [_further(study).get((row.get("label"), row.get("averaging")), {}) | row for row in csv.DictReader(file)]
-    wanted = "macro over difficulty groups" if macro else "micro over tasks"
-    return tuple(row for row in rows if row.get("averaging", wanted) == wanted)
+        rows = [_further(study).get(row.get("label", ""), {}) | row for row in csv.DictReader(file)]
+    return tuple(row for row in rows if row.get("averaging", _POOLED) == _POOLED)
 
 
 @functools.cache
-def _further(study: str) -> dict[tuple[str, str], dict[str, str]]:
-    """(label, averaging) -> the measures that are in `<study>.json` instead of a column; none of an older table."""
+def _further(study: str) -> dict[str, dict[str, str]]:
+    """label -> the measures that are in `<study>.json` instead of a column; none of an older table."""
     path = TABLES / f"{study}.json"
     labels = json.loads(path.read_text(encoding="utf-8"))["labels"] if path.is_file() else {}
     return {
-        (label, averaging): {name: "" if value is None else str(value) for name, value in values.items()}
+        label: {name: "" if value is None else str(value) for name, value in about["measures"][_POOLED].items()}
         for label, about in labels.items()
-        for averaging, values in about["measures"].items()
     }
+
+
+def publish(studies: list[str]) -> None:
+    """Copy the tables of `kerv report` to where they are committed."""
+    for study in studies:
+        found = [path for path in WRITTEN.glob(f"{study}*") if path.name.removeprefix(study)[:1] in (".", "_")]
+        if not found:
+            raise BadReference(f"no table of {study} in {WRITTEN}: kerv report study={study}")
+        for path in found:
+            shutil.copy(path, TABLES)
 
 
 def _number(row: Row, name: str, form: str, scale: float = 1.0, unit: str = "") -> str:
@@ -138,9 +152,9 @@ def _column(name: str, study: str = "") -> tuple[str, Callable[[Row], str]]:
     if not other:
         return own or title, text
     if (TABLES / f"{other}.csv").is_file():
-        there, title, mark = table_of(other, False), f"{title}, {other}", ""
+        there, title, mark = table_of(other), f"{title}, {other}", ""
     else:
-        there = tuple(row for row in table_of(f"{study}_on", False) if row["on"] == other)
+        there = tuple(row for row in table_of(f"{study}_on") if row["on"] == other)
         title, mark = f"{title}, ≈ {other}", "≈ "
     rows = {row["label"]: row for row in there}
     if not rows:
@@ -157,7 +171,7 @@ def _named(label: str) -> str:
 def markdown_table(study: str, options: list[str], names: list[str]) -> str:
     """The table as Markdown lines."""
     only = [word[5:].split(",") for word in options if word.startswith("only=")]
-    rows = [r for r in table_of(study, "macro" in options) if not only or _named(r["label"]) in only[0]]
+    rows = [r for r in table_of(study) if not only or _named(r["label"]) in only[0]]
     if not rows:
         raise BadReference(f"{study} has none of these settings")
     columns = [_column(name, study) for name in names]
@@ -166,9 +180,9 @@ def markdown_table(study: str, options: list[str], names: list[str]) -> str:
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
-def figure(study: str, macro: bool, label: str, column: str) -> str:
+def figure(study: str, label: str, column: str) -> str:
     """One number."""
-    found = [row for row in table_of(study, macro) if _named(row["label"]) == label]
+    found = [row for row in table_of(study) if _named(row["label"]) == label]
     if len(found) != 1:
         raise BadReference(f"{study} has {len(found)} settings {label}")
     return _column(column, study)[1](found[0])
@@ -181,11 +195,18 @@ def filled(text: str) -> str:
         BadReference: a table, setting or column that does not exist.
     """
     text = _TABLE.sub(lambda m: m[1] + markdown_table(m[2], m[3].split(), m[4].split()) + m[6], text)
-    return _FIGURE.sub(lambda m: m[1] + figure(m[2], bool(m[3]), m[4], m[5]) + m[7], text)
+    return _FIGURE.sub(lambda m: m[1] + figure(m[2], m[3], m[4]) + m[6], text)
 
 
 def main(words: list[str]) -> int:
-    """Fills the pages, or with --check says which differ -> exit status."""
+    """Publish tables, or fill the pages, or with --check say which differ -> exit status."""
+    if words[:1] == ["publish"]:
+        try:
+            publish(words[1:])
+        except BadReference as error:
+            print(error, file=sys.stderr)
+            return 1
+        return 0
     check, status = "--check" in words, 0
     for page in [Path(word) for word in words if not word.startswith("--")]:
         before = page.read_text(encoding="utf-8")

@@ -156,12 +156,11 @@ def without_charts() -> Iterator[None]:
     """Leave the charts of reports empty: to draw them takes most of the time of a short sweep."""
     import altair
 
-    from kerv_cli.report import plots, report
+    from kerv_cli.report import plots
 
     with pytest.MonkeyPatch.context() as patch:
         for name in ("lines_figure", "_tradeoff"):
             patch.setattr(plots, name, lambda *_: altair.concat())
-        patch.setattr(report, "png", lambda *_: b"")
         yield
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import json
+import math
 import os
 import resource
 import shutil
@@ -157,7 +158,7 @@ def test_a_measure_that_an_older_kerv_did_not_store_is_missing_until_it_is_measu
     with contextlib.closing(sqlite3.connect(tmp_path / "old" / FILE)) as file:
         file.execute("ALTER TABLE episodes DROP COLUMN closest_approach")
     store = Study(opened(tmp_path / "old"), "threshold")
-    assert load_study(store).table["near_contact_failure"].isna().all()
+    assert all(math.isnan(row.measures.near_contact_failure) for row in load_study(store).results)
     new = opened(tmp_path / "new")
     import_databases(new, [tmp_path / "old/kerv.db"])
     assert Study(new, "threshold").frame()["closest_approach"].isna().all()

@@ -105,12 +105,12 @@ def _parts(database: Database, name: str, version: str, is_running: bool) -> tup
             them would slow the study down.
     """
     from kerv_cli.report.report import Report, study_parts  # imports Altair, which takes a second
-    from kerv_cli.report.reprice import own_prices
+    from kerv_cli.report.reprice import own_profiles, repriced
     from kerv_cli.report.tables import load_study
 
     began = time.thread_time()
     data = load_study(Study(database, name))
-    priced = [] if is_running else own_prices(data, elsewhere=False)
+    priced = [] if is_running else repriced(data, own_profiles(data, elsewhere=False), lenient=True)
     parts = study_parts(Report(data, priced=priced))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return parts, max(_SECONDS, (time.thread_time() - began) / (_SHARE * cores))

@@ -48,6 +48,28 @@ def outcomes(store: Study, task: str = "", seed: int | None = None) -> list[Any]
         return list(connection.execute(query).all())
 
 
+def totals(store: Study) -> list[Any]:
+    """Return the totals of each setting's episodes, counted by the database, in the study's order.
+
+    Returns:
+        Rows with the columns `label`, `tasks`, `episodes`, `successes`, `steps`, `decodes`, `forwards`, `seconds`.
+    """
+    columns = [sa.func.sum(EPISODES.c[name]).label(name) for name in ("steps", "decodes", "forwards", "seconds")]
+    successes = sa.func.sum(sa.cast(EPISODES.c.success, sa.Integer)).label("successes")
+    query = (
+        sa.select(
+            SETTINGS.c.label, sa.func.count(WANTED.c.task.distinct()).label("tasks"),
+            sa.func.count().label("episodes"), successes, *columns,
+        )
+        .select_from(WANTED.join(SETTINGS).join(STUDIES).join(EPISODES, EPISODES.c.id == WANTED.c.episode_id))
+        .where(STUDIES.c.name == store.name)
+        .group_by(SETTINGS.c.id, SETTINGS.c.label, SETTINGS.c.position)
+        .order_by(SETTINGS.c.position)
+    )  # fmt: skip
+    with store.database.reading() as connection:
+        return list(connection.execute(query).all())
+
+
 @dataclass(frozen=True)
 class FoundEpisode:
     """A stored episode, and the newest study that uses it.

@@ -53,15 +53,14 @@ def rollout(
             f"{names}: {count(len(tasks), 'task')}, {count(total, 'episode')}, {about(left.seconds, left.source)}"
         )
         return
-    from kerv_cli.report.measures import averaged, frame_of
     from kerv_cli.report.summary import SummaryTable, setting_tables
     from kerv_cli.report.tables import load_study
 
     run_study(planned)
     data, name, recordings = load_study(planned), planned.name, planned.recordings
     if as_json:
-        end_with_json({"run": name, "folder": planned.root, "settings": frame_of(averaged(data.results)),
-                       "tasks": data.per_task, "recordings": recordings})  # fmt: skip
+        end_with_json({"run": name, "folder": planned.root, "settings": [row.columns() for row in data.results],
+                       "tasks": [row.columns() for row in data.task_results], "recordings": recordings})  # fmt: skip
     if len(planned.labels) > 1:
         console().print(SummaryTable(data.results))
     else:

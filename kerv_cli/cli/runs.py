@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from itertools import starmap
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -19,7 +19,6 @@ from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
     AsJson,
     ShowPlan,
-    console,
     database_of,
     end_with_json,
     end_with_plan,
@@ -98,21 +97,20 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
         kerv runs show last
         kerv runs show main --json
     """
-    from kerv_cli.catalogue.entries import disk_bytes, find_runs, parents, store_of
-    from kerv_cli.report.compare import compared_runs
-    from kerv_cli.report.summary import SummaryTable
-    from kerv_cli.report.tables import load_study
+    from kerv_cli.catalogue.entries import disk_bytes, find_run, find_runs, parents, store_of
+    from kerv_cli.catalogue.episodes import totals
 
     database, (name,) = database_of(settings), _run_names(names)
-    chosen = compared_runs(database, name)
-    run = chosen[0].run
-    data = load_study(store_of(run, database)) if run.has_episodes and run.episodes else None
-    labels = set(map(attrgetter("label"), chosen))
+    identifier, _, label = name.partition(":")
+    run = find_run(database, identifier)
+    rows = totals(store_of(run, database)) if run.has_episodes else []
+    chosen = [row for row in rows if label in ("", row.label)]
+    if label and not chosen:
+        raise UsageError(f"run {run.id} has no setting '{label}': it has {', '.join(row.label for row in rows)}")
     size, origin = disk_bytes(run.folder), parents(run, find_runs(database))
     if as_json:
         content = {**_entry_row(run), "made_from": origin, "bytes": size}
-        content["settings"] = [] if data is None else data.table[data.table["label"].isin(labels)]
-        end_with_json(content)
+        end_with_json({**content, "settings": [dict(row._mapping) for row in chosen]})
     lines = {"run": run.id, "kind": run.kind, "state": run.state, "started": run.started, "folder": run.folder}
     lines |= {**run.labels, "size": f"{size / 1e6:.1f} MB"}
     lines["command" if run.has_episodes else "made by"] = run.command_line or "unknown"
@@ -120,10 +118,27 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
         lines["made from"] = ", ".join(map(" ".join, origin.items()))
     for word, value in lines.items():
         typer.echo(f"{word:<9} {value}")
-    if data is not None:
-        console().print(SummaryTable([row for row in data.results if row.label in labels]))
+    if chosen:
+        print_rows(list(map(_total_row, chosen)))
+        typer.echo(f"intervals and speeds: kerv report study={run.id}{results_word(database.words)}")
     elif run.figures:
         print_table(("measure", "value"), ((name, f"{value:.4g}") for name, value in run.figures.items()))
+
+
+def _total_row(row: Any) -> dict[str, object]:
+    """Return a setting's totals as a row to print. Batched episodes have no times."""
+    from kerv_cli.report.statistics import wilson
+
+    success = wilson(row.successes, row.episodes)
+    timed = row.seconds is not None and row.steps
+    return {
+        "setting": row.label,
+        "success": f"{success.value:.0%} ({success.low:.0%}–{success.high:.0%})",
+        "episodes": row.episodes,
+        "steps per episode": f"{row.steps / row.episodes:.0f}",
+        "forwards per step": f"{row.forwards / max(1, row.steps):.3g}",
+        "ms per step": f"{1000 * row.seconds / row.steps:.3g}" if timed else None,
+    }
 
 
 @command("runs label")

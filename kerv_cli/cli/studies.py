@@ -215,7 +215,7 @@ def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None =
     return on_event
 
 
-def print_study(data: StudyData, all_columns: bool = False, how: str = "", explain: bool = False) -> None:
+def print_study(data: StudyData, all_columns: bool = False, how: str = "") -> None:
     """Print the table of a study and its note.
 
     A setting has no speedup if its episodes were not timed alternately with the baseline's. The output names such
@@ -225,17 +225,13 @@ def print_study(data: StudyData, all_columns: bool = False, how: str = "", expla
         data: The study.
         all_columns: Whether to print all columns, not only the most important ones.
         how: What to type to see all columns. If empty, `kerv report study=NAME --all`.
-        explain: Whether to say in a few words what each setting is.
     """
-    from kerv_cli.report.summary import SummaryTable, explanations, not_in_turn
+    from kerv_cli.report.summary import SummaryTable, not_in_turn
     from kerv_cli.report.tables import split_values
 
     study = data.study
     how = how or f"kerv report study={study.name}{results_word(study.database.words)} --all"
     console().print(SummaryTable(data.results, all_columns, how))
-    if explain:
-        for name, text in explanations(study.settings).items():
-            typer.echo(f"{name}: {text}")
     commits = split_values(row.provenance["git_commit"] for row in data.results)
     if len(commits) > 1:
         typer.echo(f"its episodes are of {len(commits)} commits: {', '.join(sorted(one[:12] for one in commits))}")
@@ -252,13 +248,13 @@ def print_prices(priced: Sequence[Priced]) -> None:
     from kerv_cli.report.summary import ASSUMES, repriced_summary
 
     if priced:
-        summary = repriced_summary(priced)
-        summary = summary.filter(regex="setting|per episode$")  # the page has the speeds per step and by encoder
-        print_table(summary.columns, summary.itertuples(index=False), ASSUMES)
+        table = repriced_summary(priced)
+        names = [name for name in table[0] if name.endswith(("setting", "per episode"))]  # the page has all columns
+        print_table(names, ([row[name] for name in names] for row in table), ASSUMES)
 
 
 def print_verdict(report: Report) -> None:
-    """Print the last lines about a study: the verdict, the page to open, the recording to watch, the board."""
+    """Print the last lines about a study: the verdict, the files to open, the recording to watch, the board."""
     from kerv_cli.report.verdict import caution, order_of
 
     data, study = report.data, report.data.study
@@ -269,6 +265,7 @@ def print_verdict(report: Report) -> None:
     typer.echo(f"verdict: {report.verdict.sentence}")
     if command := report.command_to_settle:
         typer.echo(f"settle it: {command}")
+    typer.echo(f"table: {report.files[0]}")
     typer.echo(f"page: {report.files[-1]}")
     typer.echo(f"browse: kerv board{results_word(study.database.words)}")
     recordings = study.recordings

@@ -99,7 +99,7 @@ def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, study: Study, as_j
         typer.echo(f"kerv: {one.setting.label} on {one.task}: {failure.reason}", err=True)
     if as_json:
         content = {"study": study.name, "folder": study.root, "episodes": counts}
-        content["settings"] = [] if data is None else data.table
+        content["settings"] = [] if data is None else [row.columns() for row in data.results]
         end_with_json({**content, "recordings": study.recordings}, code=int(bool(failed)))
     if data is not None:
         print_study(data)

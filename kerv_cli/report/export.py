@@ -13,7 +13,6 @@ from kerv_cli.catalogue.imports import export_database
 from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.store import Study
-from kerv_cli.report.measures import csv_text
 
 FORMATS = ("csv", "parquet", "db")
 _AT_ONCE = 100  # episodes in memory at a time
@@ -33,7 +32,7 @@ def export(run: RunEntry, database: Database, to: str, folder: Path) -> list[Pat
         return _to_parquet(store, episodes.assign(**run.labels), folder / run.id)
     path = folder / f"{run.id}.csv"
     shown = episodes.assign(**run.labels).drop(columns=["episode", "decode_seconds", "initial_state"])
-    write_text(path, csv_text(shown))
+    write_text(path, shown.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
     return [path]
 
 

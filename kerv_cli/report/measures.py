@@ -1,13 +1,15 @@
 """Measure the episodes of a study's settings (docs/methods.md §7). Each result is a row of the study's table.
 
-CSV and JSON files, the terminal, the page, the board and the verdict all show these rows.
+CSV and JSON files, the terminal, the page, the board and the verdict are views of these rows.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 import itertools
 import math
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from numbers import Real
 from typing import Any, NamedTuple
@@ -137,37 +139,34 @@ class Result:
     If episodes differ in the value of a text field, the field holds all values, joined by semicolons.
 
     Attributes:
-        study: Name of the study.
-        averaging: MICRO if all episodes are pooled, MACRO if difficulty groups are averaged, ONE_TASK if the row is of
-            one task.
         label: Label of the setting.
         series: Name shared by all settings that differ only in the value of the study's axis (x axis of its chart).
         unstressed: Label of the same setting without stress.
         method: The setting's decoding method.
+        where: The task of a row of one task. Empty for a row over all tasks.
         task: Names of the tasks.
         tasks: Number of tasks.
         difficulty: Difficulty groups of the tasks.
         seeds: Seeds of the episodes, as `seeds_text` writes them.
-        episodes: Number of episodes.
         baseline: Label of the setting that this setting is compared with.
-        measures: Measured values.
+        measures: Measured values, pooled over all episodes.
+        by_difficulty: The unweighted mean of the values of each difficulty group. None for a row of one task.
         runs: Number of runs (commands) from which the intervals of speed were computed.
         overrides: Overrides of the setting, as typed.
         settings: All settings as one dictionary with dotted keys, such as `threshold.r`.
         observation: What the target observes.
         hashes: Hashes of weights and data, by column (`target_sha256`).
-        stress: Kind of stress, or `none`.
         stress_level: Level of stress.
         provenance: Machine, versions and the like, by column.
         matched_success_speed: See `tables.with_matched_speed`.
     """
 
     study: str
-    averaging: str
     label: str
     series: str
     unstressed: str
     method: str
+    where: str
     task: str
     tasks: int
     difficulty: str
@@ -175,6 +174,7 @@ class Result:
     episodes: int
     baseline: str
     measures: Measures
+    by_difficulty: Measures | None
     runs: int
     overrides: str
     settings: Mapping[str, Any]
@@ -184,11 +184,6 @@ class Result:
     stress_level: int
     provenance: Mapping[str, str]
     matched_success_speed: float = math.nan
-
-    @property
-    def where(self) -> str:
-        """The task's name if the row is of one task, else the way of averaging."""
-        return self.averaging if self.averaging in (MICRO, MACRO) else self.task
 
     @property
     def is_baseline(self) -> bool:
@@ -205,15 +200,16 @@ class Result:
         """Speed per episode relative to the baseline. 1 for the baseline itself. NaN if the speed was not measured."""
         return 1.0 if self.is_baseline else self.measures.episode_speedup.value
 
+    def columns(self) -> Row:
+        """Return the row as columns of a CSV file or a data frame."""
+        return columns_of({name: value for name, value in vars(self).items() if name not in ("where", "by_difficulty")})
+
 
 def columns_of(values: Mapping[str, Any]) -> Row:
-    """Return the fields of a row as the columns of a table.
+    """Return named values as columns.
 
     An `Estimate` NAME becomes three columns: NAME, and NAME_low and NAME_high for the interval. `PairedCounts` become
     the column `pairs` (number of pairs) and one column per outcome. A mapping becomes one column per key.
-
-    Args:
-        values: Fields by name, such as `vars(result)`.
     """
     columns: Row = {}
     for name, value in values.items():
@@ -230,19 +226,18 @@ def columns_of(values: Mapping[str, Any]) -> Row:
     return columns
 
 
-def frame_of(results: Iterable[Result]) -> pd.DataFrame:
-    """Return rows as a data frame. A missing value is NaN."""
-    return pd.DataFrame(map(columns_of, map(vars, results)))
+def csv_text(rows: Sequence[Row]) -> str:
+    """Return rows as CSV text with six significant digits. Missing values are empty cells."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(rows[0])
+    for row in rows:
+        writer.writerow([f"{value:.6g}" if type(value) is float else value for value in map(_present, row.values())])
+    return text.getvalue()
 
 
-def averaged(results: Iterable[Result], averaging: str = MICRO) -> list[Result]:
-    """Return the rows that pool all episodes (MICRO), or the rows that average over difficulty groups (MACRO)."""
-    return [row for row in results if row.averaging == averaging]
-
-
-def csv_text(table: pd.DataFrame) -> str:
-    """Return a data frame as CSV text with six significant digits. Missing values are empty cells."""
-    return table.to_csv(index=False, float_format="%.6g", lineterminator="\n")
+def _present(value: Any) -> Any:
+    return "" if value is None or (isinstance(value, float) and math.isnan(value)) else value
 
 
 def is_number(value: Any) -> bool:

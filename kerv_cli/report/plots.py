@@ -1,4 +1,4 @@
-"""Draw the charts of a study from its tables: interactive ones for the page, and PNG files.
+"""Draw the charts of a study from its rows, and the curves of a training.
 
 A chart has panels side by side. Each point of a panel is a setting and has these fields: `setting`, `line`, `x`,
 `value`, `low` and `high` (95 % interval), `is_baseline`, and the text that hovering shows. When the reader clicks on a
@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import functools
 import io
-from collections.abc import Iterable, Mapping, Sequence
+import itertools
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import altair as alt
 import numpy as np
@@ -22,10 +25,9 @@ from PIL import Image
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import write_if_changed
-from kerv_cli.report.measures import Result, averaged, frame_of, is_number
-from kerv_cli.report.summary import MAIN, summary_frame
-from kerv_cli.report.tables import NO_STRESS, is_stressed
-from kerv_cli.report.tally import Tally
+from kerv_cli.report.measures import Result, is_number
+from kerv_cli.report.summary import MAIN, summary
+from kerv_cli.report.tables import NO_STRESS, StudyData
 
 INK, MUTED, BLUE, GREEN = "#1f2933", "#6b7785", "#0b6fb8", "#2a9d6f"
 COLOURS = (BLUE, "#d1495b", GREEN, "#8d5fd3", "#e08e1b", "#3aa6b9", "#7a5c3e")  # distinct when colour-blind
@@ -44,116 +46,153 @@ _CONFIG = {
 }  # fmt: skip
 
 
-def study_figures(results: Sequence[Result], axis: str, loss: float = 3.0) -> dict[str, alt.ConcatChart]:
-    """Draw the chart that suits a study, from its rows pooled over tasks.
+Point = dict[str, Any]
+Places = Mapping[str, tuple[str, float | None]]
+"""For each setting's label, the line through its point, and its x value."""
 
-    - A study of stress: success against the level of stress.
-    - A study whose settings differ along `axis`: speed and success against the value of that column.
-    - Any other study that compares settings or was timed: speed and change in success of every setting.
+
+class Panel(NamedTuple):
+    """One of the charts side by side.
+
+    Attributes:
+        title: Title above the panel.
+        points: The points. A point without x is drawn as a line across the panel.
+        xlabel: Title of the x axis.
+        names: Names of the places on the x axis, in order. Empty if x is a number.
+    """
+
+    title: str
+    points: Sequence[Point]
+    xlabel: str
+    names: Sequence[str] = ()
+
+
+def study_figures(results: Sequence[Result], axis: str, loss: float = 3.0) -> dict[str, alt.ConcatChart]:
+    """Draw the chart that suits a study.
+
+    - A study of stress (`line`): success against the level of stress.
+    - A study whose settings differ along `axis` (`line`): speed and success against the value of that column.
+    - Any other study that compares settings (`tradeoff`): speed and change in success of every setting.
 
     Args:
         results: The study's rows over all tasks.
-        axis: Table column for the x axis, such as `threshold.r`. Empty if the study has no axis.
+        axis: Key of a setting for the x axis, such as `threshold.r`. Empty if the study has no axis.
         loss: Largest acceptable loss of success, in points.
-
-    Returns:
-        The charts. Each key is the suffix of a file name: `_tradeoff` is the chart for `<study>_tradeoff.png`. Empty if
-        there is nothing to draw.
     """
-    rows = _drawn(results)
-    if is_stressed(results):
-        kinds = rows.loc[rows["stress"] != NO_STRESS, "stress"].unique()
-        points = pd.concat(rows[rows["stress"].isin([NO_STRESS, kind])].assign(panel=kind) for kind in kinds)
-        points = points.assign(line=points["unstressed"], x=points["stress_level"])
-        return {"": lines_figure([_points(points, SUCCESS)], "level of stress", "success, %")}
-    rows = with_lines(rows, axis)
-    if rows["x"].notna().any():
-        speed = _points(rows.assign(panel=TITLES[SPEED]), SPEED)
-        success = _points(rows.assign(panel=TITLES[SUCCESS]), SUCCESS)
-        return {"": lines_figure([speed, success] if len(speed) else [success], axis)}
-    return {"_tradeoff": _tradeoff(rows, loss)} if rows["pairs"].any() else {}
+    colours = colours_of(results)
+    if len({(row.stress, row.stress_level) for row in results}) > 1:  # compares disturbed worlds
+        panels = []
+        for kind in dict.fromkeys(row.stress for row in results if row.stress != NO_STRESS):
+            own = [row for row in results if row.stress in (NO_STRESS, kind)]
+            levels: Places = {row.label: (row.unstressed, float(row.stress_level)) for row in own}
+            panels.append(Panel(kind, _points(own, SUCCESS, levels), "level of stress"))
+        return {"line": lines_figure(panels, colours, "success, %")}
+    places = lines_of(results, axis)
+    if any(is_number(x) for _, x in places.values()):
+        both = [Panel(TITLES[name], _points(results, name, places), axis) for name in (SPEED, SUCCESS)]
+        return {"line": lines_figure([one for one in both if one.points], colours)}
+    return {"tradeoff": _tradeoff(results, loss, colours)} if any(row.is_compared for row in results) else {}
 
 
 def about(results: Sequence[Result]) -> str:
-    """Return the subtitle of a chart: policies, number of settings, tasks and episodes, device, number format."""
-    table = frame_of(results)
-    targets = table["policy.target"].astype(str).unique()
+    """Return the subtitle of a page: policies, number of settings, tasks and episodes, device, number format."""
+    first = results[0]
+    targets = list(dict.fromkeys(str(row.settings["policy.target"]) for row in results))
     names = ", ".join(targets) if len(targets) <= 2 else f"{len(targets)} policies"
-    settings, tasks = count(table["label"].nunique(), "setting"), count(table["tasks"].max(), "task")
-    counts = f"{settings} on {tasks}, {count(table['episodes'].max(), 'episode')} each"
-    return f"{names} · {counts} · {table['device_name'][0]}, {table['runtime.dtype'][0]}"
+    tasks, episodes = (max(map(attrgetter(name), results)) for name in ("tasks", "episodes"))
+    counts = f"{count(len(results), 'setting')} on {count(tasks, 'task')}, {count(episodes, 'episode')} each"
+    return f"{names} · {counts} · {first.provenance['device_name']}, {first.settings['runtime.dtype']}"
 
 
-def _drawn(results: Sequence[Result]) -> pd.DataFrame:
-    """Return the rows pooled over tasks, with `setting`, `is_baseline` and the text to show on hovering."""
-    rows = averaged(results)
-    texts = summary_frame(rows).iloc[:, :MAIN].add_prefix("text ")
-    frame = frame_of(rows)
-    return frame.assign(setting=frame["label"], is_baseline=frame["label"] == frame["baseline"], panel="").join(texts)
+def colours_of(results: Sequence[Result]) -> dict[str, str]:
+    """Return the colour of each setting, by label, and of each series of settings, by name.
+
+    A setting has the same colour in all charts. The settings of a series have shades of one colour. Baselines are dark.
+    """
+    series: dict[str, list[str]] = {}
+    for row in results:
+        series.setdefault(row.series, []).append(row.label)
+    dark = {row.baseline for row in results}
+    colours, hues = {}, itertools.cycle(COLOURS)
+    for name, labels in series.items():
+        hue = INK if dark & set(labels) else next(hues)
+        colours[name] = hue
+        for number, label in enumerate(labels):
+            colours[label] = _lighter(hue, 0.55 * (1 - (number + 1) / len(labels)))
+    return colours
 
 
-def with_lines(rows: pd.DataFrame, axis: str) -> pd.DataFrame:
-    """Add two columns: `line`, the name of the line that joins points, and `x`, the setting's value on the x axis.
+def _lighter(colour: str, share: float) -> str:
+    parts = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
+    return "#" + "".join(f"{round(part + (255 - part) * share):02x}" for part in parts)
+
+
+def lines_of(results: Sequence[Result], axis: str) -> Places:
+    """Return for each label the line that joins its point to others, and the setting's value on the x axis.
 
     Settings that differ only in the value of `axis` share a line. If a setting's value is no number, or if no other
-    setting shares its line, then `line` is the setting's label, and `x` is missing.
+    setting shares its line, the line is the setting's label, and x is None.
     """
-    numbers = rows[axis] if axis in rows else pd.Series(None, rows.index, dtype=object)
-    x = numbers.map(lambda value: float(value) if is_number(value) else None).astype(float)
-    line = rows["series"].where(x.notna(), rows["label"])
-    alone = line.groupby(line).transform("size") == 1
-    return rows.assign(line=line.mask(alone, rows["label"]), x=x.mask(alone)).sort_values("x", kind="stable")
+    places: dict[str, tuple[str, float | None]] = {}
+    for row in results:
+        value: Any = row.columns().get(axis)
+        places[row.label] = (row.series, float(value)) if is_number(value) else (row.label, None)
+    shared = Counter(line for line, x in places.values() if x is not None)
+    return {label: (line, x) if shared[line] > 1 else (label, None) for label, (line, x) in places.items()}
 
 
-def _points(rows: pd.DataFrame, column: str) -> pd.DataFrame:
-    """Return the points of a chart that shows one `column` of the table. Success is scaled to per cent."""
-    scale = 1.0 if column == SPEED else 100.0
-    texts = rows.filter(regex="^text ").columns
-    points = rows.reindex(columns=["setting", "line", "x", "panel", "is_baseline", *texts])
-    points["value"] = scale * rows[column].astype(float)
-    points["low"] = scale * rows[f"{column}_low"].astype(float)
-    points["high"] = scale * rows[f"{column}_high"].astype(float)
-    return points.dropna(subset="value")
+def _points(results: Sequence[Result], column: str, places: Places) -> list[Point]:
+    """Return the points of a panel that shows one measure of the settings in `places`. Success is in per cent."""
+    scale, points = 1.0 if column == SPEED else 100.0, []
+    texts = {cells["setting"]: dict(itertools.islice(cells.items(), MAIN)) for cells in summary(results)}
+    for row in results:
+        estimate = getattr(row.measures, column)
+        if row.label in places and is_number(estimate.value):
+            line, x = places[row.label]
+            value, low, high = (scale * number if is_number(number) else None for number in estimate)
+            point = {"setting": row.label, "line": line, "x": x, "is_baseline": row.is_baseline}
+            point |= {"value": value, "low": low, "high": high}
+            points.append(point | {f"text {name}": text for name, text in texts[row.label].items()})
+    return sorted(points, key=lambda point: (point["x"] is None, point["x"]))
 
 
-def _tooltip(points: pd.DataFrame) -> list[alt.Tooltip]:
-    texts = points.filter(regex="^text ").columns
+def _tooltip(points: Sequence[Point]) -> list[alt.Tooltip]:
+    texts = (name for name in points[0] if name.startswith("text "))
     return [alt.Tooltip(f"{name}:N", title=name.removeprefix("text ")) for name in texts]
 
 
 def _faded(full: float) -> alt.When:
-    """Return the opacity of a point, for Altair to evaluate in the browser.
-
-    The opacity is 0.12 if the reader has clicked on another setting, and `full` otherwise.
-    """
+    """Return the opacity of a point: 0.12 if the reader has clicked on another setting, and `full` otherwise."""
     return alt.when("picked == '' || picked == datum.setting").then(alt.value(full)).otherwise(alt.value(0.12))
 
 
-def _tradeoff(rows: pd.DataFrame, loss: float) -> alt.ConcatChart:
+def _tradeoff(results: Sequence[Result], loss: float, colours: Mapping[str, str]) -> alt.ConcatChart:
     """Draw speed and change in success of every setting in two panels, one row per setting.
 
     A dashed line marks the baseline's speed in the first panel, and a loss of `loss` points in the second. A setting
     whose interval is right of the line is shown to be faster than the baseline, or to lose less than `loss`.
     """
-    baselines = rows["baseline"].unique()
-    than = f"than {baselines[0]}" if len(baselines) == 1 else "than the baseline"
+    baselines, labels = {row.baseline for row in results}, [row.label for row in results]
+    than = f"than {baselines.copy().pop()}" if len(baselines) == 1 else "than the baseline"
     panels = {
         SPEED: (1.0, f"right of the dashed line: faster {than}"),
         DIFFERENCE: (-loss, f"right of the dashed line: loses less than {loss:g} points"),
     }
     charts: list[alt.LayerChart] = []
     for column, (bound, hint) in panels.items():
-        points = _points(rows, column)
-        same = points["is_baseline"]  # nothing is uncertain about a comparison with itself
-        points = points.assign(low=points["low"].mask(same), high=points["high"].mask(same))
-        if points.empty:
+        points = _points(results, column, dict.fromkeys(labels, ("", None)))
+        for point in points:
+            point["colour"] = colours[point["setting"]]
+            if point["is_baseline"]:  # nothing is uncertain about a comparison with itself
+                point["low"] = point["high"] = None
+        if not points:
             continue
-        ends = points[["value", "low", "high"]].stack()
-        kind = "log" if column == SPEED and ends.max() > _SPREAD * ends.min() else "linear"
+        ends = [point[name] for point in points for name in ("value", "low", "high") if point[name] is not None]
+        kind = "log" if column == SPEED and max(ends) > _SPREAD * min(ends) else "linear"
         names = alt.Axis(title=None, grid=True, ticks=False, labelPadding=8, domain=False, labels=not charts)
-        base = alt.Chart(points).encode(
-            y=alt.Y("setting:N", scale=alt.Scale(domain=list(rows["setting"])), axis=names),
-            color=alt.when("datum.is_baseline").then(alt.value(INK)).otherwise(alt.value(BLUE)),
+        base = alt.Chart(alt.InlineData(points)).encode(
+            y=alt.Y("setting:N", scale=alt.Scale(domain=labels), axis=names),
+            color=alt.Color("colour:N", scale=None),
             tooltip=_tooltip(points),
         )
         scale = alt.Scale(type=kind, nice=False, padding=10, **({} if kind == "log" else {"zero": False}))
@@ -166,40 +205,40 @@ def _tradeoff(rows: pd.DataFrame, loss: float) -> alt.ConcatChart:
     return _chart(charts, 2)
 
 
-def lines_figure(measures: Iterable[pd.DataFrame], xlabel: str, ylabel: str | None = None) -> alt.ConcatChart:
-    """Draw panels side by side with one legend. A line has the same colour in every panel.
+def lines_figure(panels: Sequence[Panel], colours: Mapping[str, str], ylabel: str | None = None) -> alt.ConcatChart:
+    """Draw panels side by side with one legend.
 
     Args:
-        measures: Tables of points, from `_points`. Points with the same `panel` share a panel. A point without x is
-            drawn as a line across the panel.
-        xlabel: Title of the x axis.
+        panels: The panels.
+        colours: Colours of lines and settings.
         ylabel: Title of the y axis. If None, the y axis has no title.
     """
-    points = pd.concat(measures)
-    names = points["line"].unique()
-    dark = set(points.loc[points["is_baseline"], "line"])
-    colours = []
-    for number, name in enumerate(names):
-        colours.append(INK if name in dark else COLOURS[number % len(COLOURS)])
-    legend = alt.Legend(orient="bottom", columns=4, title=None)
-    colour = alt.Color("line:N", scale=alt.Scale(domain=list(names), range=colours), legend=legend)
-    scale, charts = alt.Scale(zero=False, padding=12), []
-    for title, part in points.groupby("panel", sort=False):
-        base = alt.Chart(part).encode(color=colour, tooltip=_tooltip(part))
-        y, low = alt.Y("value:Q", scale=scale, title=ylabel), alt.Y("low:Q", scale=scale, title=ylabel)
-        drawn, alone = base.transform_filter("isValid(datum.x)"), base.transform_filter("!isValid(datum.x)")
-        drawn = drawn.encode(x=alt.X("x:Q", scale=scale, title=xlabel))
+    lines = list(dict.fromkeys(point["line"] for panel in panels for point in panel.points))
+    scale = alt.Scale(domain=[*lines, *(set(colours) - set(lines))], range=[])
+    scale.range = [colours[name] for name in scale.domain]
+    legend, charts = alt.Legend(orient="bottom", columns=4, title=None, values=lines), []
+    alone_scale = alt.Scale(zero=False, padding=12)
+    for panel in panels:
+        base = alt.Chart(alt.InlineData(panel.points)).encode(
+            color=alt.Color("line:N", scale=scale, legend=legend), tooltip=_tooltip(panel.points)
+        )
+        y, low = (alt.Y(f"{name}:Q", scale=alone_scale, title=ylabel) for name in ("value", "low"))
+        x = alt.X("x:Q", scale=alone_scale, title=panel.xlabel)
+        if panel.names:
+            x = alt.X("x:N", sort=list(panel.names), title=panel.xlabel, axis=alt.Axis(labelAngle=0))
+        alone, drawn = base.transform_filter("!isValid(datum.x)"), base.transform_filter("isValid(datum.x)").encode(x=x)
+        own = alt.Color("setting:N", scale=scale, legend=legend)
         layers = [
             alone.mark_rule(strokeDash=[5, 4], strokeWidth=1.5).encode(y=y, opacity=_faded(0.9)),
-            drawn.mark_rule(strokeWidth=2).encode(y=low, y2="high:Q", opacity=_faded(0.35)),
+            drawn.mark_rule(strokeWidth=2).encode(y=low, y2="high:Q", color=own, opacity=_faded(0.35)),
             drawn.mark_line(strokeWidth=1.5).encode(y=y),
-            drawn.mark_point(filled=True, size=60, cursor="pointer").encode(y=y, opacity=_faded(1.0)),
+            drawn.mark_point(filled=True, size=60, cursor="pointer").encode(y=y, color=own, opacity=_faded(1.0)),
         ]
-        charts.append(alt.layer(*layers).properties(title=str(title), width=_WIDTH, height=_HEIGHT))
+        charts.append(alt.layer(*layers).properties(title=panel.title, width=_WIDTH, height=_HEIGHT))
     return _chart(charts, _ACROSS)
 
 
-def latency_figure(results: Sequence[Result], latencies: pd.DataFrame) -> alt.ConcatChart:
+def latency_figure(results: Sequence[Result], latencies: Sequence[Mapping[str, Any]]) -> alt.ConcatChart:
     """Draw success against decoding latency, with one panel per kind of delay compensation.
 
     Only settings whose world goes on during a decode are drawn. A setting's x value is the latency of the AR baseline
@@ -209,45 +248,58 @@ def latency_figure(results: Sequence[Result], latencies: pd.DataFrame) -> alt.Co
         results: The study's rows over all tasks.
         latencies: The same study's `latency_table`.
     """
-    rows = _drawn(results)
-    rows = (
-        rows.assign(x=rows["label"].map(latencies.set_index("label")["ar_latency_ms"]))
-        .query("x > 0")
-        .sort_values("x", kind="stable")
-    )
-    panels = "delay compensation: " + rows["rollout.delay_compensation"]
-    points = _points(rows.assign(line=rows["method"], panel=panels), SUCCESS)
-    return lines_figure([points], "an autoregressive decode takes, ms", "success, %")
+    panels: dict[str, dict[str, tuple[str, float | None]]] = {}
+    for row in latencies:
+        if row["ar_latency_ms"] > 0:
+            panel = panels.setdefault(f"delay compensation: {row['rollout.delay_compensation']}", {})
+            panel[row["label"]] = row["method"], row["ar_latency_ms"]
+    colours = colours_of(results)
+    colours |= {row.method: colours[row.label] for row in reversed(results)}
+    xlabel = "an autoregressive decode takes, ms"
+    drawn = [Panel(title, _points(results, SUCCESS, places), xlabel) for title, places in panels.items()]
+    return lines_figure(drawn, colours, "success, %")
 
 
-def acceptance_figure(tallies: Mapping[str, Tally], references: Mapping[str, str]) -> alt.ConcatChart:
+def acceptance_figure(data: StudyData) -> alt.ConcatChart:
     """Draw how many draft tokens were accepted, in three panels with a line per setting.
 
     The first two panels show the share of accepted tokens, by position in the draft and by DoF. They count only tokens
     whose predecessors in the draft were all accepted. The third panel shows the share of drafts with each number of
     accepted tokens.
-
-    Args:
-        tallies: Counts by the setting's label.
-        references: For each setting's label, the label of the setting that it is compared with.
     """
-    frames = []
-    for label, tally in tallies.items():
+    dofs = data.dofs(max(len(tally.reached) for tally in data.tallies.values()))
+    places: tuple[list[Point], list[Point], list[Point]] = [], [], []
+    for label, tally in data.tallies.items():
         reached, accepted = tally.by_position
-        panels = {
-            "Accepted tokens, %, by position in the draft": (1, accepted, reached),
-            "Accepted tokens, %, by DoF": (1, tally.accepted, tally.reached),
-            "Drafts, %, by number of accepted tokens": (0, tally.lengths, np.full(len(tally.lengths), tally.drafts)),
-        }
-        for panel, (first, part, whole) in panels.items():
-            points = pd.DataFrame({"x": first + np.arange(len(part)), "part": part, "whole": whole}).query("whole > 0")
-            share = 100.0 * points["part"] / points["whole"]
-            is_baseline = references.get(label) == label
-            fields: dict[str, Any] = {"setting": label, "line": label, "panel": panel, "is_baseline": is_baseline}
-            fields |= {"value": share, "low": share, "high": share, "text setting": label, "text place": points["x"]}
-            fields |= {"text tokens": points["part"], "text of": points["whole"]}
-            frames.append(points[["x"]].assign(**fields))
-    return lines_figure(frames, "position, DoF or number")
+        lines = (
+            (range(1, len(accepted) + 1), accepted, reached),
+            (dofs, tally.accepted, tally.reached),
+            (range(len(tally.lengths)), tally.lengths, np.full(len(tally.lengths), tally.drafts)),
+        )
+        for points, (names, parts, wholes) in zip(places, lines, strict=True):
+            for x, part, whole in zip(names, parts.tolist(), wholes.tolist(), strict=True):
+                if whole:
+                    share = 100.0 * part / whole
+                    point: Point = {
+                        "setting": label,
+                        "line": label,
+                        "x": x,
+                        "value": share,
+                        "low": share,
+                        "high": share,
+                    }
+                    points.append(
+                        point | {"text setting": label, "text place": x, "text tokens": part, "text of": whole}
+                    )
+    titles = (
+        "Accepted tokens, %, by position in the draft",
+        "Accepted tokens, %, by DoF",
+        "Drafts, %, by number of accepted tokens",
+    )
+    labels = "position in the draft", "degree of freedom", "accepted tokens"
+    names_of: tuple[Sequence[str], ...] = (), dofs, ()
+    panels = itertools.starmap(Panel, zip(titles, places, labels, names_of, strict=True))
+    return lines_figure([panel for panel in panels if panel.points], colours_of(data.results))
 
 
 def _best_step(log: pd.DataFrame) -> float:

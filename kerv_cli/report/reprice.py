@@ -6,11 +6,12 @@ a profile: a file that `kerv bench` writes, with the seconds that each operation
 
 from __future__ import annotations
 
+import itertools
 from collections import defaultdict
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -18,7 +19,7 @@ import pyarrow.compute as pc
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.episodes.cost import COUNTED, READ_PHASES, Profile, Work, prices, read_profile, work_of
-from kerv_cli.report.measures import MICRO, Measures, Result, Row, averaged, columns_of, measure, paired, speedups
+from kerv_cli.report.measures import MICRO, Measures, Result, Row, columns_of, measure, paired, speedups
 from kerv_cli.report.profiles import NamedProfile, open_profiles
 from kerv_cli.report.tables import StudyData
 
@@ -44,8 +45,8 @@ class Priced:
     encoders: Mapping[str, float]
 
 
-def prices_table(priced: Iterable[Priced]) -> pd.DataFrame:
-    """Return the estimated speeds as a data frame: one row per machine and setting."""
+def prices_table(priced: Sequence[Priced]) -> list[Row]:
+    """Return the estimated speeds as rows of a table: one per machine and setting."""
     rows = []
     for one in priced:
         result, of, measured = one.result, one.measures, one.result.measures
@@ -53,11 +54,16 @@ def prices_table(priced: Iterable[Priced]) -> pd.DataFrame:
         row |= {"machine": one.machine.title, "projected": one.machine.is_projected}
         row |= {"episode_speedup": of.episode_speedup, "speedup": of.speedup}
         row |= {"time_per_episode_ms": of.time_per_episode_ms, "time_per_step_ms": of.time_per_step_ms}
-        row |= {"latency_p95_ms": of.latency_p95_ms, "encoders": one.encoders}
+        row |= {"latency_p95_ms": of.latency_p95_ms, **{name: one.encoders.get(name) for name in encoders_of(priced)}}
         row |= {"measured_episode_speedup": measured.episode_speedup, "measured_speedup": measured.speedup}
         row |= {"measured_on": result.provenance["device_name"], "episodes": result.episodes, "pairs": of.pairs}
         rows.append(columns_of(row))
-    return pd.DataFrame(rows)
+    return rows
+
+
+def encoders_of(priced: Sequence[Priced]) -> list[str]:
+    """Return the columns of further assumptions about the encoder that some of the estimates have."""
+    return list(dict.fromkeys(itertools.chain.from_iterable(one.encoders for one in priced)))
 
 
 def repriced(data: StudyData, profiles: Sequence[NamedProfile], lenient: bool = False) -> list[Priced]:
@@ -66,7 +72,7 @@ def repriced(data: StudyData, profiles: Sequence[NamedProfile], lenient: bool = 
     Args:
         data: The study's episodes.
         profiles: For each machine, the seconds that each operation of a decode takes there (`kerv bench`).
-        lenient: Leave out a profile that lacks a cost, instead of raising an error.
+        lenient: Leave out a profile that lacks a cost, and settings without times, instead of raising an error.
 
     Returns:
         One estimate per profile and setting. Settings that run no decoder are left out.
@@ -79,7 +85,7 @@ def repriced(data: StudyData, profiles: Sequence[NamedProfile], lenient: bool = 
         return []
     decoded, works = data.episodes.groupby("label")[["forwards", "skipped_decodes"]].sum().any(axis=1), {}
     for label in data.labels:
-        if decoded[label]:
+        if decoded[label] and not (lenient and data.settings[label].batch > 1):
             works[label] = _work_of_label(data, label)
     rows = []
     for named in profiles if works else ():
@@ -95,7 +101,7 @@ def repriced(data: StudyData, profiles: Sequence[NamedProfile], lenient: bool = 
         for name, profile in named.encoders.items():
             for of, measures in _estimated(data, works, profile).items():
                 encoders[of][name] = measures.episode_speedup.value
-        found = [row for row in averaged(data.results) if row.label in works]
+        found = [row for row in data.results if row.label in works]
         rows += [Priced(row, named, estimated[row.label], encoders[row.label]) for row in found]
     return rows
 
@@ -108,16 +114,15 @@ def _estimated(data: StudyData, works: Mapping[str, _LabelWork], profile: Profil
     return measure(priced, pairs, MICRO, speedups(pairs, all_pairs=True))
 
 
-def own_prices(data: StudyData, elsewhere: bool = True) -> list[Priced]:
-    """Return the study's speeds, estimated for the machines that the study's file names and for those that ran it.
+def own_profiles(data: StudyData, elsewhere: bool = True) -> list[NamedProfile]:
+    """Return the cost profiles of the machines that the study's file names, and of those that ran the study.
 
-    For a machine that ran the study, this needs a profile that `kerv bench` measured on that machine. Comparing such
-    estimates with the measured times shows how accurate the cost model is. A profile that is missing or lacks a cost
-    is left out.
+    For a machine that ran the study, this needs a profile that `kerv bench` measured there. The estimates beside the
+    measured times show how accurate the cost model is. A profile that is missing is left out.
 
     Args:
-        data: The study's episodes.
-        elsewhere: Whether to estimate for the machines that the study's file names, too.
+        data: The study.
+        elsewhere: Whether to include the machines that the study's file names.
     """
     results, profiles = data.study.database.results, dict[str, NamedProfile]()
     for name in data.study.machines if elsewhere else ():
@@ -131,9 +136,7 @@ def own_prices(data: StudyData, elsewhere: bool = True) -> list[Priced]:
             profile = read_profile(results / "bench" / f"{name}.json")
             if profile.about.get("device_name") in devices:
                 profiles.setdefault(name, NamedProfile(name, profile))
-    with suppress(UsageError):
-        return repriced(data, list(profiles.values()), lenient=True)
-    return []
+    return list(profiles.values())
 
 
 class _LabelWork(NamedTuple):
@@ -156,8 +159,7 @@ def _work_of_label(data: StudyData, label: str) -> _LabelWork:
     Raises:
         UsageError: The setting's episodes ran in a batch and have no times.
     """
-    setting = data.settings[label]
-    if (batch := setting.batch) > 1:
+    if (batch := data.settings[label].batch) > 1:
         raise UsageError(
             f"setting '{label}' ran {batch} episodes at a time, without times: run it with rollout.batch=1"
         )
@@ -166,28 +168,13 @@ def _work_of_label(data: StudyData, label: str) -> _LabelWork:
     rounds = table["rounds"].combine_chunks()
     counts = pc.list_value_length(rounds).to_numpy(zero_copy_only=False).astype(np.int64)
     every = rounds.flatten()
-    columns = {}
-    for name in (*COUNTED, "committed"):
-        if every.type.get_field_index(name) >= 0:  # rounds had no levels before
-            columns[name] = every.field(name).to_numpy(zero_copy_only=False)
+    columns = {name: every.field(name).to_numpy(zero_copy_only=False) for name in (*COUNTED, "committed")}
     decode = np.repeat(np.arange(len(counts)), counts)
     size = int(np.bincount(decode, columns.pop("committed")).max())
     phases = {phase: np.nan_to_num(table[f"seconds.{phase}"].to_numpy()) for phase in READ_PHASES}
     looked_up = ~np.isnan(table["similarity"].to_numpy(zero_copy_only=False).astype(float))
-    drafted = levels_of(setting.settings)
-    levels = columns.get("levels", np.full(len(decode), np.nan)).astype(float)
-    columns["levels"] = np.where(np.isnan(levels), drafted, levels).astype(int)
     work = work_of(columns, counts, phases, looked_up, size)
     return _LabelWork(work, table["episode"].to_numpy(), size)
-
-
-def levels_of(settings: Mapping[str, Any]) -> int:
-    """Return the number of levels of the trees that a setting drafts. It is 0 if the setting drafts no trees.
-
-    It is needed for episodes of older versions of kerv, whose stored rounds do not have this number.
-    """
-    proposer = settings.get("proposer", {})
-    return int(proposer["depth"]) if proposer.get("shape") == "tree" else 0
 
 
 def _priced(episodes: pd.DataFrame, work: _LabelWork, profile: Profile) -> pd.DataFrame:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
 
 import markupsafe
-import pandas as pd
 from rich import box
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
@@ -19,9 +18,9 @@ from rich.text import Text
 
 from kerv_cli.base.durations import count
 from kerv_cli.engine.record import PHASES
-from kerv_cli.episodes.identity import Setting, stress_text
+from kerv_cli.episodes.identity import stress_text
 from kerv_cli.lab.plan import seeds_text
-from kerv_cli.report.measures import MACRO, MICRO, Result, averaged, frame_of, is_number
+from kerv_cli.report.measures import Measures, Result, is_number
 from kerv_cli.report.profiles import ENCODERS
 from kerv_cli.report.reprice import Priced
 from kerv_cli.report.statistics import Estimate
@@ -32,12 +31,11 @@ APART = "*"
 SPEEDS = {"episode_speedup": "speed, per episode", "speedup": "speed, per step"}
 """Table column of each kind of speed -> its heading."""
 DIFFERENCE = "change in success"
+LATENCY = "slowest 5 % of decodes, ms"
+Cells = dict[str, str]
+"""One row of a printed table: heading to text. All rows of a table have the same headings."""
 MAIN = 5
 """Number of columns that are always shown. `--all`, and "more columns" on the page, show all other columns."""
-NOTE = (
-    "In brackets: 95 % intervals. Change in success: points against the baseline, from the same initial states. Speed: "
-    "times as fast as the baseline. Slowest 5 % of decodes: they take at least this many ms."
-)
 _TASK_COLUMNS = (
     "task", "success", "steps per episode", "forwards per step", "tokens per verification", "drafts accepted",
     "time per step, ms",
@@ -46,33 +44,22 @@ _HEADING = 12
 """Width at which a heading is wrapped, in characters."""
 _LABEL = 16
 """Width at which a label is wrapped, in characters."""
-METHODS = {
-    "ar": "token by token: one run of the policy for each token",
-    "early_unverified": "a small network writes every action, nobody verifies it",
-    "expert": "Meta-World's scripted expert, which is no policy",
-    "heisd": "similar demonstrations draft; very similar ones run unverified",
-    "jacobi": "guesses all tokens and corrects them in parallel, without a drafter",
-    "kerv": "Spec-VLA; after a rejection a Kalman filter predicts the rest",
-    "last_action": "the last action drafts, only equal tokens are accepted, nothing is trained",
-    "naive_sd": "a small network drafts, only equal tokens are accepted",
-    "one_pass": "a network drafts the action; one run verifies prompt and draft",
-    "parallel": "a policy that writes all tokens in one run",
-    "retrieval_unverified": "the most similar demonstration runs, nobody verifies it",
-    "spec_vla": "a small network drafts a tree of tokens, the policy verifies",
+MEANINGS = {
+    "success": "share of episodes that solved their task",
+    DIFFERENCE: "points more or less than {0}, over pairs: episodes of both from the same initial state",
+    SPEEDS[
+        "episode_speedup"
+    ]: "inference time of {0} until success or the horizon ÷ that of the setting, over pairs on the same device",
+    SPEEDS["speedup"]: "the same for the time of a control step. * means: some pairs were not measured in turn; the "
+    "speed is of the others",
+    LATENCY: "95 % of the decodes take less time than this",
+    "tokens unverified": "executed tokens that the policy neither wrote nor accepted",
+    "tokens per verification": "how many tokens one verification yields on average (acceptance length)",
+    "speed at matched success": "speed of the method's fastest setting that is shown to lose less than 3 points",
+    "pairs lost / won": "initial states that only {0}, and only the setting, solved",
+    "success, by difficulty": "unweighted mean over the groups of tasks; all other columns pool all tasks",
 }
-"""Family of methods -> what its methods do."""
-WORDS = {
-    "chain": "drafts one chain of tokens in place of a tree",
-    "code": "as in the public code, where the paper says otherwise",
-    "literal": "the paper's formula, word for word",
-    "skip": "drafts that are similar enough run unverified",
-    "streak": "after drafts that agree, more of them run unverified",
-    "strict": "accepts only tokens that equal the policy's",
-    "tree": "then a small network drafts a tree of tokens",
-    "tuned": "changed by us, to suit these policies",
-}
-"""Word in the label of a setting -> what the word means."""
-UNVERIFIED = "executed tokens that the policy neither wrote nor accepted"
+"""Heading -> what the column means. `{0}` is the baseline."""
 ASSUMES = (
     "Speed against the baseline by the cost model: the recorded decodes at a profile's costs, as if the other machine "
     "and target decoded the same tokens in the same control steps; success is the recorded policy's"
@@ -124,16 +111,21 @@ def _speed(row: Result, speed: Estimate) -> str:
     return interval(speed, unit="×") + (APART if apart else "")
 
 
-def cells_of(row: Result) -> dict[str, str]:
-    """Return a row of a study's table as a dictionary from heading to text. The first `MAIN` are always shown."""
-    of = row.measures
+def cells_of(row: Result, of: Measures | None = None) -> Cells:
+    """Return a row of a study's table as a dictionary from heading to text. The first `MAIN` are always shown.
+
+    Args:
+        row: The row.
+        of: The measures to show. If None, those that are pooled over all episodes.
+    """
+    of = of or row.measures
     return {
         "setting": row.label,
         "success": interval(of.success, ".0f", " %", 100.0),
         SPEEDS["episode_speedup"]: _speed(row, of.episode_speedup),
         DIFFERENCE: "" if row.is_baseline else interval(of.difference, "+.0f", "", 100.0, " to "),
         "tokens unverified": share(of.unverified_share),
-        "slowest 5 % of decodes, ms": number(of.latency_p95_ms),
+        LATENCY: number(of.latency_p95_ms),
         SPEEDS["speedup"]: _speed(row, of.speedup),
         "a decode takes, ms": number(of.felt_latency_ms),
         "steps on a held action": share(of.held_share),
@@ -152,21 +144,22 @@ def cells_of(row: Result) -> dict[str, str]:
     }
 
 
-def summary_frame(results: Sequence[Result], averaging: str = MICRO) -> pd.DataFrame:
-    """Return a study's table as text: the main columns, and every other column with a value that is not 0 or empty.
+def summary(results: Sequence[Result]) -> list[Cells]:
+    """Return a study's table as text: the main columns, and every other column with a value that is not 0 or empty."""
+    rows = list(map(cells_of, results))
+    names = list(rows[0])
+    used = [name for name in names if name in names[:MAIN] or {row[name] for row in rows} - {MISSING, "0 %", ""}]
+    return [{name: row[name] for name in used} for row in rows]
 
-    Args:
-        results: The study's rows over all tasks.
-        averaging: MICRO takes the rows that pool all tasks. MACRO takes the rows that average over difficulty groups.
-    """
-    frame = pd.DataFrame(map(cells_of, averaged(results, averaging)))
-    is_used = ~frame.isin([MISSING, "0 %", ""]).all() | frame.columns.isin(frame.columns[:MAIN])
-    return frame.loc[:, is_used]
+
+def columns_shown(rows: Sequence[Cells]) -> set[str]:
+    """Return the headings whose columns have a value."""
+    return {name for name in rows[0] if {row[name] for row in rows} - {MISSING, ""}}
 
 
 @dataclass(frozen=True)
 class SummaryTable:
-    """A study's table as `rich` prints it, pooled over tasks.
+    """A study's table as `rich` prints it.
 
     Attributes:
         results: The study's rows over all tasks.
@@ -180,62 +173,76 @@ class SummaryTable:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
         """Yield the title, the table and the notes below it."""
-        rows = averaged(self.results)
-        first = rows[0]
-        table = frame_of(rows)
-        counts = f"{count(table['tasks'].max(), 'task')}, {count(table['episodes'].max(), 'episode')} per setting"
+        results = self.results
+        first = results[0]
+        tasks, episodes = (max(map(attrgetter(name), results)) for name in ("tasks", "episodes"))
+        counts = f"{count(tasks, 'task')}, {count(episodes, 'episode')} per setting"
         device = f"{first.provenance['device_name']}, {first.settings['runtime.dtype']}"
         yield Text(f"{first.study}: {counts}, {device}", "bold", overflow="fold")
-        frame = summary_frame(rows)
-        own = [name for name in frame.columns if name.replace(" ", "_") in first.measures.added]  # of plugins
-        shown = frame if self.all else frame[[*frame.columns[:MAIN], *own]]
-        for part in _parts(shown, options.max_width):
-            yield _printed(part)
-        if self.how and len(shown.columns) < len(frame.columns):
-            yield Text(f"{len(shown.columns)} of {len(frame.columns)} columns; {self.how} shows all")
-        several = ", under the same stress and clock" if table["baseline"].nunique() > 1 else ""
-        yield Text(f"{note_of(rows)} Baseline: {first.baseline}{several}.")
-        if frame[SPEEDS["episode_speedup"]].str.endswith(APART).any():
+        rows = summary(results)
+        own = [name for name in rows[0] if name.replace(" ", "_") in first.measures.added]  # of plugins
+        names = list(rows[0]) if self.all else list(dict.fromkeys([*list(rows[0])[:MAIN], *own]))
+        for part in _parts(rows, names, options.max_width):
+            yield _printed(rows, part)
+        if self.how and len(names) < len(rows[0]):
+            yield Text(f"{len(names)} of {len(rows[0])} columns; {self.how} shows all")
+        several = ", under the same stress and clock" if len({row.baseline for row in results}) > 1 else ""
+        yield Text(f"{note_of(results, names)}Baseline: {first.baseline}{several}.")
+        if any(row[SPEEDS["episode_speedup"]].endswith(APART) for row in rows):
             yield Text(f"{APART} only from pairs that were measured in turn")
-        untimed = table.loc[table["time_per_step_ms"].isna(), "label"]
-        if len(untimed):
+        untimed = [row.label for row in results if not row.measures.is_timed]
+        if untimed:
             yield Text(f"not timed, for success alone: {', '.join(untimed)}")
 
 
-def note_of(results: Sequence[Result]) -> str:
-    """Return the note below a table. Its last sentence says from how many runs the intervals of speed were computed."""
-    runs = min(map(attrgetter("runs"), results))
-    return f"{NOTE} Intervals of speed: of {f'{runs} runs' if runs > 2 else 'this run alone'}."
+def note_of(results: Sequence[Result], names: Sequence[str] = ()) -> str:
+    """Return the note below a table. It explains only columns that the table shows.
+
+    Args:
+        results: The study's rows over all tasks.
+        names: Headings that the table shows. If empty, all columns with values.
+    """
+    shown = columns_shown(summary(results)) & set(names or cells_of(results[0]))
+    notes = ["In brackets: 95 % intervals."]
+    if any(row.is_compared for row in results):
+        notes += ["Change in success: points against the baseline, from the same initial states."]
+    if any(is_number(row.speed) and not row.is_baseline for row in results):
+        runs = min(map(attrgetter("runs"), results))
+        of_runs = f"{runs} runs" if runs > 2 else "this run alone"
+        notes += [f"Speed: times as fast as the baseline. Intervals of speed: of {of_runs}."]
+    if LATENCY in shown:
+        notes += ["Slowest 5 % of decodes: they take at least this many ms."]
+    return " ".join([*notes, ""])
 
 
-def _printed(frame: pd.DataFrame) -> Table:
+def _printed(rows: Sequence[Cells], names: Sequence[str]) -> Table:
     printed = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    for name in frame.columns:
+    for name in names:
         is_label = name == "setting"  # labels wrap, measures do not
         printed.add_column(
             _heading(name), justify="left" if is_label else "right", overflow="fold", no_wrap=not is_label
         )
-    for row in frame.itertuples(index=False):
-        printed.add_row(*map(escape, map(str, row)))
+    for row in rows:
+        printed.add_row(*(escape(row[name]) for name in names))
     return printed
 
 
 def _heading(name: str) -> str:
-    """Return a heading wrapped into lines."""
     return textwrap.fill(name, _HEADING, break_long_words=False)
 
 
-def _parts(frame: pd.DataFrame, width: int) -> Iterator[pd.DataFrame]:
-    """Cut a table into parts that fit into `width` characters. The first part always has label, success and speed."""
-    widths = {name: 2 + max(map(len, [*_heading(name).split("\n"), *frame[name]])) for name in frame.columns}
-    label = min(widths["setting"], 2 + max(_LABEL, *map(len, " ".join(frame["setting"]).split())))
-    part = list(frame.columns[:3])
-    for name in frame.columns[3:]:
+def _parts(rows: Sequence[Cells], names: Sequence[str], width: int) -> Iterator[list[str]]:
+    """Cut a table's columns into parts that fit into `width` characters. The first part has label, success, speed."""
+    widths = {name: 2 + max(map(len, [*_heading(name).split("\n"), *(row[name] for row in rows)])) for name in names}
+    labels = " ".join(row["setting"] for row in rows)
+    label = min(widths["setting"], 2 + max(_LABEL, *map(len, labels.split())))
+    part = list(names[:3])
+    for name in names[3:]:
         if label + sum(map(widths.__getitem__, (*part[1:], name))) > width:
-            yield frame[part]
+            yield part
             part = ["setting"]
         part.append(name)
-    yield frame[part]
+    yield part
 
 
 def not_in_turn(results: Sequence[Result]) -> list[str]:
@@ -263,8 +270,8 @@ def setting_tables(data: StudyData) -> Iterator[tuple[Any, Any, str]]:
     """
     episodes, setting = data.episodes, data.study.settings[0]
     rows = []
-    for row in [*data.task_results, *averaged(data.results)]:
-        task = "all" if row.averaging == MICRO else row.task
+    for row in [*data.task_results, *data.results]:
+        task = row.where or "all"
         success, accepted = f"{row.measures.successes}/{row.episodes}", number(row.measures.accepted_per_round)
         cells = cells_of(row) | {"task": task, "success": success, "drafts accepted": accepted}
         if task != "all" or row.tasks > 1:
@@ -287,42 +294,42 @@ def setting_tables(data: StudyData) -> Iterator[tuple[Any, Any, str]]:
         yield ("phase", "ms per decode", "share"), shares, "time by phase"
 
 
-def suite_table(results: Sequence[Result]) -> pd.DataFrame:
-    """Return the page's table of settings, pooled over tasks.
+def suite_table(results: Sequence[Result]) -> list[Cells]:
+    """Return the page's table of settings.
 
     If the tasks have several difficulty groups, further columns have the unweighted mean of the groups.
     """
-    frame = summary_frame(results)
+    rows = summary(results)
     if any(";" in row.difficulty for row in results):
-        macro = summary_frame(results, MACRO)
-        for name in ("success", *SPEEDS.values()):
-            frame[f"{name}, by difficulty"] = macro.get(name, MISSING)
-    return frame
+        for cells, row in zip(rows, results, strict=True):
+            by_difficulty = cells_of(row, row.by_difficulty)
+            cells |= {f"{name}, by difficulty": by_difficulty[name] for name in ("success", *SPEEDS.values())}
+    return rows
 
 
-def task_table(results: Sequence[Result]) -> pd.DataFrame:
+def task_table(results: Sequence[Result]) -> list[Cells]:
     """Return the page's table of successes and speeds per episode, by task and setting.
 
     Tasks are rows and settings are columns, unless there are more settings than tasks.
     """
-    cells: dict[str, dict[str, str]] = {}
+    cells: dict[tuple[str, str], str] = {}
     for row in results:
-        cell, speed = f"{row.measures.successes}/{row.episodes}", row.measures.episode_speedup.value
-        if not row.is_baseline and is_number(speed):
-            cell += f" · {speed:.2f}×"
-        cells.setdefault(row.label, {})[row.task] = cell
-    table = pd.DataFrame(cells).sort_index().fillna(MISSING).rename_axis("task")
-    return (table.T.rename_axis("setting") if len(table.columns) > len(table) else table).reset_index()
+        speed = row.measures.episode_speedup.value
+        timed = f" · {speed:.2f}×" if not row.is_baseline and is_number(speed) else ""
+        cells[row.task, row.label] = f"{row.measures.successes}/{row.episodes}{timed}"
+    tasks, labels = sorted({row.task for row in results}), list(dict.fromkeys(row.label for row in results))
+    if len(labels) > len(tasks):
+        return [{"setting": label} | {task: cells.get((task, label), MISSING) for task in tasks} for label in labels]
+    return [{"task": task} | {label: cells.get((task, label), MISSING) for label in labels} for task in tasks]
 
 
-def repriced_summary(priced: Sequence[Priced]) -> pd.DataFrame:
-    """Return a table of speeds to print: one row per setting.
+def repriced_summary(priced: Sequence[Priced]) -> list[Cells]:
+    """Return a table of measured and estimated speeds: one row per setting, some columns per machine.
 
-    Two columns hold the measured speeds. Two more columns per machine hold the estimated speeds. If the machine's
-    profile was computed instead of measured, a third column holds the speeds under further assumptions about the time
-    of the vision encoder, see `ENCODERS`.
+    If a machine's profile was computed instead of measured, one more column holds the speeds under further assumptions
+    about the time of the vision encoder, see `ENCODERS`.
     """
-    rows: dict[str, dict[str, str]] = {}
+    rows: dict[str, Cells] = {}
     for row in priced:
         machine, is_baseline = row.machine.title, row.result.is_baseline
         cells = rows.setdefault(row.result.label, {"setting": row.result.label})
@@ -334,34 +341,7 @@ def repriced_summary(priced: Sequence[Priced]) -> pd.DataFrame:
             heading = f"{machine}: per episode, if the encoder takes {', '.join(ENCODERS.values())}"
             texts = ["1"] * len(ENCODERS) if is_baseline else map("{:.2f}".format, row.encoders.values())
             cells[heading] = f"{' / '.join(texts)}×"
-    return pd.DataFrame(rows.values())
-
-
-def explained(label: str, method: str = "") -> str:
-    """Explain the label of a setting, word by word. Empty if none of its words is in the glossary.
-
-    Args:
-        label: The setting's label, such as `spec_vla chain`.
-        method: The setting's method, such as `spec_vla`. Empty: the label's first word.
-    """
-    method = method or re.split(r"[ ,]", label)[0]
-    family = max((name for name in METHODS if method == name or method.startswith(f"{name}_")), key=len, default="")
-    rest = f"{method.removeprefix(family)} {label.removeprefix(method)}" if family else f"{method} {label}"
-    words = [text for word, text in WORDS.items() if word in re.split(r"[\W_]+", rest)]
-    return "; ".join(filter(None, (METHODS.get(family, ""), *words)))
-
-
-def explanations(settings: Iterable[Setting]) -> dict[str, str]:
-    """Explain a table's settings, and the table's column *tokens unverified*.
-
-    Returns:
-        A dictionary from label or heading to explanation. Settings whose labels have no known word are left out.
-    """
-    found = {}
-    for one in settings:
-        if text := explained(one.label, one.settings["method"]):
-            found[one.label] = text
-    return found | {"tokens unverified": UNVERIFIED}
+    return list(rows.values())
 
 
 def with_code(text: str) -> markupsafe.Markup:

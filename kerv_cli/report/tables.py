@@ -7,7 +7,7 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
@@ -23,11 +23,10 @@ from kerv_cli.report.measures import (
     MARGIN,
     MICRO,
     ONE_TASK,
+    Measures,
     Result,
     Row,
     Speeds,
-    averaged,
-    frame_of,
     is_number,
     measure,
     paired,
@@ -49,6 +48,9 @@ SOLVED = 0.20
 """Smallest success rate at which the baseline counts as solving its tasks."""
 NO_STRESS = "none"
 _AT_ONCE = 200  # episodes in memory at a time
+MOST_TALLIED = 1000
+"""Number of episodes of a setting whose decodes are read, to count accepted tokens by position and DoF."""
+NO_TALLY = Tally.of_records((), 0)
 _ONE_STATE = ("engine", "git_commit", "device_name")
 """Columns in which runs must agree. Otherwise their speeds are not averaged."""
 
@@ -144,7 +146,7 @@ class StudyData:
         Each label comes with the speed per episode relative to the next slower setting. The slowest setting has NaN.
         Empty if the settings are compared with several baselines, or if fewer than two settings were timed.
         """
-        timed = [row for row in averaged(self.results) if is_number(row.speed)]
+        timed = [row for row in self.results if is_number(row.speed)]
         if len(timed) < 2 or len(set(self.references.values())) > 1:
             return []
         labels = list(map(attrgetter("label"), sorted(timed, key=attrgetter("speed"), reverse=True)))
@@ -155,21 +157,26 @@ class StudyData:
 
     @functools.cached_property
     def tallies(self) -> dict[str, Tally]:
-        """How many draft tokens were accepted, for each setting that verified drafts. This reads all stored decodes."""
-        episodes, tallies = self.episodes.groupby("label")["episode"], {}
+        """How many draft tokens were accepted, for each setting that verified drafts.
+
+        Reads the decodes of at most `MOST_TALLIED` episodes of each setting, the first seeds of every task.
+        """
+        tallies = {}
         for label in self.labels:
-            numbers, tally = episodes.get_group(label).tolist(), Tally.of_records((), 0)
+            own = self.episodes[self.episodes["label"] == label]
+            if not own["verifications"].any():
+                continue
+            numbers, tally = own.sort_values("seed", kind="stable")["episode"].tolist()[:MOST_TALLIED], NO_TALLY
             for first in range(0, len(numbers), _AT_ONCE):
                 decodes = self.study.decodes(numbers[first : first + _AT_ONCE], ("rounds",))
                 tally += Tally.of_rounds(decodes["rounds"].combine_chunks().flatten())
-            if tally.drafts:
-                tallies[label] = tally
+            tallies[label] = tally
         return tallies
 
     @functools.cached_property
     def results(self) -> list[Result]:
-        """Two rows per setting: one pools all tasks (MICRO), one averages over difficulty groups (MACRO)."""
-        return with_matched_speed([*_results(self, MICRO), *_results(self, MACRO)])
+        """One row per setting, over all tasks, in the study's order."""
+        return with_matched_speed(_results(self, MICRO))
 
     @functools.cached_property
     def task_results(self) -> list[Result]:
@@ -177,19 +184,19 @@ class StudyData:
         return with_matched_speed(_results(self, ONE_TASK))
 
     @functools.cached_property
-    def latencies(self) -> pd.DataFrame:
+    def latencies(self) -> list[Row]:
         """The rows of settings whose world goes on during a decode (`latency_table`)."""
         return latency_table(self.results)
 
-    @functools.cached_property
-    def table(self) -> pd.DataFrame:
-        """`results` as a data frame."""
-        return frame_of(self.results)
+    @property
+    def varied(self) -> list[str]:
+        """Keys of the settings that the study varies, such as `threshold.r`."""
+        keys = dict.fromkeys(itertools.chain.from_iterable(one.varies for one in self.study.settings))
+        return list(keys | ({self.study.axis: None} if "." in self.study.axis else {}))
 
-    @functools.cached_property
-    def per_task(self) -> pd.DataFrame:
-        """`task_results` as a data frame."""
-        return frame_of(self.task_results)
+    def dofs(self, number: int) -> Sequence[str]:
+        """Names of the `number` DoFs of an action."""
+        return dof_names(str(self.episodes["task"].iloc[0]), number)
 
 
 def references_of(settings: Sequence[Setting], baseline: str) -> dict[str, str]:
@@ -275,6 +282,14 @@ def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
     return labelled.astype(dict.fromkeys(texts, object))
 
 
+def dof_names(task: str, number: int) -> Sequence[str]:
+    """Return the names of the DoFs of a task's actions. They are 0, 1, … if no environment here has the task."""
+    for spec in specs().values():
+        if task in spec.tasks and len(spec.actions.names) == number:
+            return spec.actions.names
+    return list(map(str, range(number)))
+
+
 def difficulty_of(task: str) -> str:
     """Return the task's difficulty group, or `other` if no environment has the task."""
     for spec in specs().values():
@@ -284,41 +299,37 @@ def difficulty_of(task: str) -> str:
 
 
 def _results(data: StudyData, averaging: str) -> list[Result]:
-    """Return a row per setting, or per task and setting, in the study's order.
+    """Return a row per setting (MICRO), or per task and setting (ONE_TASK), in the study's order."""
 
-    Args:
-        data: The study.
-        averaging: MICRO (pool all episodes), MACRO (average over difficulty groups) or ONE_TASK (a row for each task).
-    """
-    speeds = speedups_of_runs(data.pairs_of_runs, averaging, data.same_pairs)
-    measured = measure(data.episodes, data.pairs, averaging, speeds)
+    def measured(way: str) -> Mapping[Any, Measures]:
+        speeds = speedups_of_runs(data.pairs_of_runs, way, data.same_pairs)
+        return measure(data.episodes, data.pairs, way, speeds)
+
+    pooled, by_difficulty = measured(averaging), measured(MACRO) if averaging == MICRO else {}
     texts = data.episodes.reindex(columns=["label", "task", "difficulty", "seed", *_PROVENANCE])
     texts = texts.astype(object).where(texts.notna(), None)
     where = texts["task"] if averaging == ONE_TASK else pd.Series("", texts.index)
-    ordered = pd.Categorical(texts["label"], data.labels)
-    groups: Any = texts.groupby([where, ordered], observed=True)
+    groups: Any = texts.groupby([where, pd.Categorical(texts["label"], data.labels)], observed=True)
     results = []
     for (task, label), part in groups:
         setting = data.settings[label]
         stress = stress_of(setting.settings)
-        hashes = {}
-        for name, value in sorted(setting.identity.items()):
-            if name != OBSERVATION:
-                hashes[f"{name}_sha256"] = value
+        hashes = {f"{name}_sha256": value for name, value in sorted(setting.identity.items()) if name != OBSERVATION}
         row = Result(
             study=data.name,
-            averaging=averaging,
             label=label,
             series=_series_of(setting, data.study.axis),
             unstressed=data.unstressed[label],
             method=setting.settings["method"],
+            where=task,
             task=_joined(sorted(set(part["task"]))),
             tasks=part["task"].nunique(),
             difficulty=_joined(sorted(set(part["difficulty"]))),
             seeds=seeds_text(part["seed"].unique()),
             episodes=len(part),
             baseline=data.references[label],
-            measures=measured[(task, label) if averaging == ONE_TASK else label],
+            measures=pooled[(task, label) if task else label],
+            by_difficulty=by_difficulty.get(label),
             runs=len(data.pairs_of_runs),
             overrides=setting.overrides,
             settings=flatten(without(setting.settings, NOT_DETERMINING - {"policy"})),
@@ -342,7 +353,7 @@ def with_matched_speed(rows: Sequence[Result]) -> list[Result]:
     the baseline itself, and if the baseline does not solve the tasks.
 
     Args:
-        rows: One row per setting and task, or per setting and way of averaging.
+        rows: One row per setting, or per setting and task.
     """
     solved, groups = set(), dict[tuple[str, str, str], list[Result]]()
     for row in rows:
@@ -449,15 +460,17 @@ _LATENCY_COLUMNS = (
 )  # fmt: skip
 
 
-def latency_table(results: Iterable[Result]) -> pd.DataFrame:
+def latency_table(results: Sequence[Result]) -> list[Row]:
     """Return the rows of settings whose world goes on during a decode (`rollout.clock=real`).
 
     A row is left out if the world of its baseline waits during decodes. The added column `ar_latency_ms` is the mean
     latency of the baseline's decodes.
     """
-    rows = frame_of(averaged(results))
-    of_baseline = rows["baseline"].map(rows.set_index("label")["felt_latency_ms"])
-    delayed = rows.assign(ar=rows["baseline"], ar_latency_ms=of_baseline).dropna(
-        subset=["felt_latency_ms", "ar_latency_ms"]
-    )
-    return delayed.reindex(columns=list(_LATENCY_COLUMNS))
+    felt = {row.label: row.measures.felt_latency_ms for row in results}
+    delayed = []
+    for row in results:
+        latency = felt.get(row.baseline, math.nan)
+        if is_number(row.measures.felt_latency_ms) and is_number(latency):
+            values = row.columns() | {"ar": row.baseline, "ar_latency_ms": latency}
+            delayed.append({name: values.get(name) for name in _LATENCY_COLUMNS})
+    return delayed

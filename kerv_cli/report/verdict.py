@@ -10,16 +10,15 @@ interval shows it. If the baseline's success rate is below `SOLVED`, no setting 
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import NamedTuple
 
 from kerv_cli.base.durations import count
 from kerv_cli.report import statistics as stats
-from kerv_cli.report.measures import Result, Row, averaged, columns_of, is_number
+from kerv_cli.report.measures import Result, is_number
 from kerv_cli.report.tables import SOLVED, passing, safety
 
 POINTS = 100.0
@@ -27,39 +26,33 @@ POINTS = 100.0
 
 @dataclass(frozen=True)
 class Choice:
-    """Which setting to take, for one task or for all tasks together.
+    """Which setting to take.
 
     The bound is the largest loss of success that the reader accepts.
 
     Attributes:
-        where: The task, or `all tasks`.
         pairs: Number of pairs of the setting with the most pairs. A pair is one episode of the baseline and one of the
             setting, from the same initial state.
         baseline_success: Success rate of the baseline.
-        front: Settings that no other setting beats in both speed and success, the fastest first.
         chosen: Fastest setting that is shown to lose less success than the bound. Empty if there is no such
             setting.
-        loss_at_most: Upper bound on the chosen setting's loss of success, in points, at 95 % confidence. NaN if no
-            setting is chosen.
         candidate: If no setting is chosen, the fastest setting that would be chosen after more pairs, if the rates
             stay the same. Empty if more pairs would not help, or if a setting is chosen.
         candidate_pairs: About how many pairs in all would let the candidate be chosen. NaN without a candidate.
-        tested: Number of settings whose loss of success is tested. A setting is tested if it is faster than the
-            baseline or was not timed.
+        tested: Number of settings whose loss of success is tested.
+        untimed: Settings that are not tested, because others were timed and they were not.
         episode_speedup: Speed per episode of the chosen setting, or else of the candidate, relative to the baseline.
             NaN if that setting was not timed.
         runs: Number of runs (commands) from which the interval of `episode_speedup` was computed.
     """
 
-    where: str
     pairs: int
     baseline_success: float
-    front: tuple[str, ...] = ()
     chosen: str = ""
-    loss_at_most: float = math.nan
     candidate: str = ""
     candidate_pairs: float = math.nan
     tested: int = 0
+    untimed: tuple[str, ...] = ()
     episode_speedup: stats.Estimate = stats.NO_ESTIMATE
     runs: int = 0
 
@@ -70,44 +63,28 @@ class Choice:
 
     @property
     def is_unsolved(self) -> bool:
-        """Whether the baseline's success rate is too low for a recommendation."""
+        """Whether the baseline succeeds too rarely for a recommendation."""
         return self.baseline_success < SOLVED
 
-    def as_dict(self) -> Row:
-        """Return all fields by name, as JSON values. `front` becomes one text, joined by semicolons."""
-        return columns_of(vars(self)) | {"front": ";".join(self.front)}
 
-
-def choices(results: Iterable[Result], task_results: Iterable[Result], loss: float) -> list[Choice]:
-    """Find out which setting to take: first for all tasks together, then for each task.
+def choose(rows: Sequence[Result], loss: float) -> Choice:
+    """Choose the fastest setting that is shown to lose less success than `loss`.
 
     Args:
-        results: The study's rows over all tasks.
-        task_results: The study's rows per task, sorted by task.
-        loss: Largest acceptable loss of success against the baseline, in points.
-    """
-    tasks = itertools.groupby(task_results, attrgetter("task"))
-    return [choose("all tasks", averaged(results), loss), *(choose(task, list(rows), loss) for task, rows in tasks)]
-
-
-def choose(where: str, rows: Sequence[Result], loss: float) -> Choice:
-    """Choose the fastest setting that is shown to lose less success than `loss`, for one task or for all tasks.
-
-    Args:
-        where: The task's name, or `all tasks`.
-        rows: Rows of the study's table for that task or for all tasks: one per setting, the baseline included.
+        rows: One row per setting, the baseline included.
         loss: Largest acceptable loss of success against the baseline, in points.
     """
     success = next((row.measures.success.value for row in rows if row.is_baseline), math.nan)
     pairs = max((row.measures.pairs for row in rows if not row.is_baseline), default=0)
-    choice = Choice(where, pairs, success)
+    choice = Choice(pairs, success)
     if choice.is_unsolved:
         return choice
     order = safest_first(rows)
-    choice = replace(choice, front=tuple(map(attrgetter("label"), pareto(rows))), tested=len(order))
+    untimed = tuple(row.label for row in rows if row.is_compared and not is_number(row.speed) and row not in order)
+    choice = replace(choice, tested=len(order), untimed=untimed)
     if passed := passing(order, loss / POINTS):
         best = _fastest(passed)
-        choice = replace(choice, chosen=best.label, loss_at_most=-POINTS * best.measures.difference.low)
+        choice = replace(choice, chosen=best.label)
     else:
         needed, reached = 0.0, {}
         for row in order:
@@ -122,14 +99,16 @@ def choose(where: str, rows: Sequence[Result], loss: float) -> Choice:
     return replace(choice, episode_speedup=best.measures.episode_speedup, runs=best.runs)
 
 
-def safest_first(rows: Iterable[Result]) -> list[Result]:
+def safest_first(rows: Sequence[Result]) -> list[Result]:
     """Return the rows of the settings to test, the safest first. Success does not influence the order.
 
     A setting is safer if it has fewer unverified tokens, or else more forwards per control step (`safety`). Settings
-    that are equally safe keep the study's order. The baseline and settings without pairs are left out. So are settings
-    that were timed and were not faster than the baseline.
+    that are equally safe keep the study's order. Settings that are not faster than the baseline are left out, and
+    settings without a measured speed, unless no setting has one: then success alone decides.
     """
-    return sorted((row for row in rows if row.is_compared and not row.speed <= 1), key=safety)
+    compared = [row for row in rows if row.is_compared]
+    is_timed = any(is_number(row.speed) for row in compared)
+    return sorted((row for row in compared if row.speed > 1 or not is_timed), key=safety)
 
 
 def _fastest(rows: Sequence[Result]) -> Result:
@@ -144,20 +123,6 @@ def _fastest(rows: Sequence[Result]) -> Result:
         return (found.low > 1, found.value) if is_number(found.value) else (False, -math.inf)
 
     return max(reversed(rows), key=speed)
-
-
-def pareto(rows: Iterable[Result]) -> list[Result]:
-    """Return the rows that no other row beats in both speed per episode and success, the fastest first.
-
-    The baseline has speed 1. Rows without a measured speed are left out.
-    """
-    point = attrgetter("speed", "measures.success.value")
-    timed = [row for row in rows if is_number(row.speed)]
-    front: list[Result] = []
-    for row in sorted(timed, key=point, reverse=True):
-        if not front or point(row)[1] > point(front[-1])[1] or point(row) == point(front[-1]):
-            front.append(row)
-    return front
 
 
 class Verdict(NamedTuple):
@@ -182,14 +147,14 @@ def verdict_of(results: Sequence[Result], loss: float) -> Verdict:
         results: The study's rows over all tasks.
         loss: Largest acceptable loss of success against the baseline, in points (percentage points).
     """
-    rows = averaged(results)
+    rows = results
     baselines = {row.baseline for row in rows if row.is_compared}
     if not baselines:
         rates = ", ".join(f"{row.label} {POINTS * row.measures.success.value:.1f} %" for row in rows)
         return Verdict(f"success: {rates}.")
     if len(baselines) > 1:
         return Verdict(f"{under_conditions(rows)}.")
-    found = choose("all tasks", rows, loss)
+    found = choose(rows, loss)
     episodes = math.ceil(found.candidate_pairs / rows[0].tasks) if found.candidate_pairs <= stats.MOST_PAIRS else 0
     return Verdict(f"{sentence(found, loss, rows[0].baseline)}.", found.is_shown, episodes)
 
@@ -221,15 +186,19 @@ def sentence(choice: Choice, loss: float, baseline: str) -> str:
         return unsolved(baseline, choice.baseline_success)
     bound = f"loses less than {loss:g} points of success against {baseline}"
     if choice.chosen:
-        return f"{choice.chosen} {bound} (95 % confidence, {choice.pairs} pairs){_speed(choice)}"
+        return f"{choice.chosen} {bound} (95 % confidence, {count(choice.pairs, 'pair')}){_speed(choice)}"
+    pairs, untimed = count(choice.pairs, "pair"), ""
+    if choice.untimed:
+        untimed = f"; without a measured speed: {', '.join(choice.untimed)}"
     if not choice.tested:
-        return f"no setting is shown to be faster per episode than {baseline} ({choice.pairs} pairs)"
-    pairs = count(choice.pairs, "pair")
+        return f"no setting is shown to be faster per episode than {baseline} ({pairs}){untimed}"
     if not choice.candidate:
         return f"{pairs} cannot show a setting that is faster and {bound}; {_missing(choice)}"
-    factor = f": {_factor(choice)}" if is_number(choice.episode_speedup.value) else ""
-    fastest = f"the fastest setting that may keep the success is {choice.candidate}{factor}"
-    return f"{fastest}. {pairs} cannot show that it {bound}; {_missing(choice)}"
+    if is_number(choice.episode_speedup.value):
+        named = f"the fastest setting that may keep the success is {choice.candidate}: {_factor(choice)}"
+    else:
+        named = f"no speed was measured; {choice.candidate} may keep the success"
+    return f"{named}. {pairs} cannot show that it {bound}; {_missing(choice)}"
 
 
 def order_of(by_speed: Sequence[tuple[str, stats.Estimate]]) -> str:
@@ -258,17 +227,6 @@ def unsolved(baseline: str, success: float) -> str:
         f"{baseline} does not solve these tasks ({100 * success:.0f} % of its episodes succeed), so no setting is "
         "recommended"
     )
-
-
-def short_sentence(choice: Choice) -> str:
-    """Say in a few words which setting to take for one task, or why no setting is recommended."""
-    if choice.is_unsolved:
-        return f"{choice.where}: the baseline does not solve it ({100 * choice.baseline_success:.0f} %)"
-    if choice.chosen:
-        return f"{choice.where}: {choice.chosen}" + ("" if choice.is_shown else ", not shown to be faster")
-    if not choice.tested:
-        return f"{choice.where}: no setting is shown to be faster ({choice.pairs} pairs)"
-    return f"{choice.where}: open after {choice.pairs} pairs; {_missing(choice)}"
 
 
 def _speed(choice: Choice) -> str:
@@ -331,7 +289,7 @@ def caution(results: Sequence[Result]) -> str:
     The line names policies that are given the positions of object and goal, and settings that verify nothing.
     """
     privileged, unverified = set(), []
-    for row in averaged(results):
+    for row in results:
         if "privileged" in row.observation:
             privileged.add(str(row.settings["policy.target"]))
         if row.measures.unverified_share == 1:
