@@ -4,7 +4,7 @@ import copy
 import dataclasses
 import json
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
@@ -23,7 +23,8 @@ from mock_target import SEVEN
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.files import read_json, sha256_of, write_json
-from kerv_cli.base.paths import find_target
+from kerv_cli.base.manifests import read_file
+from kerv_cli.base.paths import find_target, shipped_dir
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Chunk, Follower
 from kerv_cli.engine.record import Round
@@ -40,7 +41,7 @@ from kerv_cli.methods.calibration import (
     Variability,
 )
 from kerv_cli.methods.heisd.curvature import BoundaryRanges
-from kerv_cli.methods.heisd.datastore import Datastore
+from kerv_cli.methods.heisd.datastore import Datastore, Manifest
 from kerv_cli.methods.kerv.prediction import PREDICTORS, Noise
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.checkpoint import TargetDescription, read_target
@@ -455,3 +456,29 @@ def test_the_command_prints_what_it_found(own):
         assert said in shown
     assert "s_min" not in shown
     assert (own / "artifacts/calibration/without/calibration.json").is_file()
+
+
+@pytest.mark.parametrize("where", ["calibration.json", "datastore/manifest.json"])
+def test_a_changed_digit_anywhere_in_a_file_that_decides_results_is_noticed(where, tmp_path):
+    """Each number and each word of the shipped file, one at a time: also of its provenance, and of a manifest's key."""
+    shipped = shipped_dir() / "mt10-vision" / where
+    schema: Any = Calibration if where == "calibration.json" else Manifest
+    value, path = json.loads(shipped.read_text()), tmp_path / "changed.json"
+    assert "digest" in value
+    read_file(schema, shipped)
+
+    def leaves(at: Any) -> Iterator[tuple[Any, Any]]:
+        for key, one in at.items() if isinstance(at, dict) else enumerate(at):
+            if isinstance(one, dict | list):
+                yield from leaves(one)
+            elif key != "digest":
+                yield at, key
+
+    changed = list(leaves(value))
+    for at, key in changed[:: len(changed) // 40]:
+        before = at[key]
+        at[key] = f"{before}x" if isinstance(before, str) else 7 if before != 7 else 8
+        path.write_text(json.dumps(value))
+        with pytest.raises(CheckpointError, match="its content does not have the hash that it names"):
+            read_file(schema, path)
+        at[key] = before

@@ -15,6 +15,9 @@ from kerv_cli.base.limits import check_settings
 
 T = TypeVar("T")
 
+DIGEST = "digest"
+"""Field of a JSON file with the SHA-256 of all its other fields, sorted by name, as compact JSON."""
+
 
 @functools.cache
 def _adapter(kind: Any) -> Any:
@@ -58,9 +61,23 @@ def read_file(kind: type[T], path: Path) -> T:
     """Read a JSON file into a dataclass. Unknown fields are ignored.
 
     Raises:
-        CheckpointError: The file is missing or not JSON, or a field is missing, of a wrong type or out of range.
+        CheckpointError: The file is missing or not JSON, its content has another hash than it names, or a field is
+            missing, of a wrong type or out of range.
     """
-    return read(kind, read_mapping(path), str(path), tolerant=True)
+    value = read_mapping(path)
+    digest = value.pop(DIGEST, None)  # files of before version 1.1 have none
+    if digest is not None and digest != _digest_of(value):
+        raise CheckpointError(f"{path} is damaged: its content does not have the hash that it names")
+    return read(kind, value, str(path), tolerant=True)
+
+
+def stamped(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a JSON file with a hash of all of them, which `read_file` checks."""
+    return {**fields, DIGEST: _digest_of(fields)}
+
+
+def _digest_of(fields: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()
 
 
 def content_of(key: Sequence[str], chunk: int, target: str, files: Mapping[str, str]) -> str:

@@ -21,6 +21,7 @@ import numpy as np
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.files import write_json
+from kerv_cli.base.manifests import stamped
 from kerv_cli.base.paths import check_free
 from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import set_up
@@ -132,7 +133,7 @@ def plan_calibration(
         )
         if old is not None:
             calibration = completed(old, calibration)
-        write_json(path, asdict(calibration))
+        write_json(path, stamped(asdict(calibration)))
         no_drafter = ", no drafter" if "drafter" in missing else ""
         notes = [] if decoder else [f"no reference levels K_S: decodes={settings.decodes}{no_drafter}"]
         notes += [] if skip else ["no skip levels: no datastore of these tasks (kerv build datastore)"]

@@ -16,6 +16,7 @@ import torch
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import sha256_of, write_folder, write_json
+from kerv_cli.base.manifests import stamped
 from kerv_cli.base.paths import check_free
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.spaces import ObservationSpace
@@ -94,7 +95,7 @@ def plan_datastore(settings: BuildDatastoreSettings, database: Database) -> Plan
                 tasks=shards,
                 provenance=provenance_of("kerv build datastore", settings, device),
             )
-            write_json(new / stored.MANIFEST, asdict(manifest))
+            write_json(new / stored.MANIFEST, stamped(asdict(manifest)))
 
         write_folder(folder, write)
         return folder, stored.Datastore.open(folder, target)
