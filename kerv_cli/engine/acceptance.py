@@ -53,13 +53,8 @@ def accept_by_group(
     group's other tokens are judged.
 
     Args:
-        tree: The draft, n nodes.
-        target_tokens: The target's prediction after the last committed token, then after each of the n nodes.
-        start: Number of committed tokens. A node at depth d is token start + d of the chunk.
         limits: Largest accepted distance per DoF, in bins.
         group_limit: Largest accepted sum of a group's distances, in bins.
-        bounds: For each DoF, the index of the first DoF of its kinematic group and the index after the last one
-            (`ActionSpace.bounds`).
     """
     alive = [False] * len(tree)  # whether no limit is broken on the path to this node
     in_group = [0] * len(tree)  # distances summed within the node's group
@@ -84,11 +79,6 @@ def nearest_child(tree: TokenTree, node: int, target_tokens: Sequence[int]) -> i
     """Return the child of `node` whose token is nearest to the target's prediction after `node`.
 
     Returns None if `node` has no children.
-
-    Args:
-        tree: The draft, n nodes.
-        node: Index of the parent, or −1 (ROOT) for the last committed token.
-        target_tokens: The target's prediction after the last committed token, then after each of the n nodes.
     """
     children = [i for i, parent in enumerate(tree.parents) if parent == node]
     return min(children, key=lambda i: abs(tree.tokens[i] - target_tokens[node + 1]), default=None)
@@ -145,5 +135,4 @@ class StrictRule(DistanceRule):
     """Accepts only draft tokens that equal the target's. Decoding is then lossless."""
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """Return one zero for each of the D DoFs, or a single zero for FAST tokens. The radius `r` is not used."""
         return (0,) * self.space.kinds

@@ -31,10 +31,6 @@ def chunk_steps(chunk: int, trained: int) -> int:
 
     Args:
         chunk: Number of control steps that the user chose. If 0, `trained` is returned.
-        trained: Number of control steps that the target was trained for.
-
-    Raises:
-        UsageError: `chunk` is negative, or larger than `trained`.
     """
     if not 0 <= chunk <= trained:
         raise UsageError(f"chunk={chunk}: the target was trained for {trained} control steps")
@@ -139,7 +135,7 @@ class TargetSide:
 
     @property
     def prompt_length(self) -> int:
-        """Number of prompt tokens P. Reading this property encodes the prompt, if that has not been done yet."""
+        """Number of prompt tokens P. Reading it encodes the prompt, if that has not been done yet."""
         return self.prompt.shape[1]
 
     def uncached(self, tokens: Sequence[int]) -> list[int]:
@@ -171,6 +167,7 @@ class Chunk:
         verified_in_prefill: The draft that the prefill verified, and the target's prediction after the last committed
             token and after each node. Empty if it verified none.
         forwards: Number of forwards of the target so far.
+        similarity: Cosine of the most similar entry of a datastore. None if no part searched.
         reason: The skip rule's reason to skip or to verify. None if there is no reason.
         closed: If a rectifier ended the chunk early: the normalised actions (S, D) of its S ≤ H control steps.
             Otherwise None.
@@ -189,13 +186,13 @@ class Chunk:
     rejection: Rejection = Rejection()
     verified_in_prefill: tuple[TokenTree, Sequence[int]] = TokenTree((), (), ()), ()
     forwards: int = 0
+    similarity: float | None = None
     reason: str | None = None
     closed: np.ndarray | None = None
     filled: dict[int, float] = field(default_factory=dict)
 
     @property
     def dofs(self) -> int:
-        """Number of DoFs D."""
         return self.space.dofs
 
     @property
@@ -207,7 +204,6 @@ class Chunk:
 
     @property
     def ended(self) -> bool:
-        """Whether an end token, or a rectifier's prediction, ended the chunk before it had N tokens."""
         return self.closed is not None or (bool(self.tokens) and self.tokens[-1] == self.space.end)
 
     @property
@@ -217,7 +213,6 @@ class Chunk:
 
     @property
     def compensated(self) -> int:
-        """Number of action values that a rectifier predicted instead of the target."""
         return len(self.filled) if self.closed is None else max(0, self.closed.size - len(self.tokens))
 
     @property
@@ -242,9 +237,6 @@ class Chunk:
     def targets_along(self, chain: Sequence[int]) -> list[int] | None:
         """Return the target's predictions along a chain of the draft that the prefill verified.
 
-        Args:
-            chain: Draft of the whole chunk, N tokens. It need not be the path that was accepted.
-
         Returns:
             The target's token at each verified position, N − 1 or N tokens. None if the prefill verified fewer than
             N − 1 tokens of this chain.
@@ -263,8 +255,6 @@ class Chunk:
         """Commit the tokens that one forward of the target decided.
 
         Args:
-            record: The record of this round.
-            tokens: The tokens to commit.
             rejection: Tokens of the draft and of the target after the rejected token. None if no token was rejected.
         """
         self.forwards += 1
@@ -273,16 +263,10 @@ class Chunk:
         self.rejection = rejection or Rejection()
 
     def commit_token(self, token: int) -> None:
-        """Commit the single token of a forward that verified no draft."""
         mode, start = "decode" if self.tokens else "prefill", len(self.tokens)
         self.commit(Round(mode, start=start, target_tokens=(token,), committed=1), [token])
 
     def take(self, decision: SkipDecision) -> None:
-        """Store the decision of a skip rule. If it chose tokens, commit them.
-
-        Raises:
-            KervError: The rule chose fewer than N tokens, or a drafted token is out of range.
-        """
         self.reason, tokens, proposer = decision.reason, decision.tokens, decision.proposer
         if tokens is None:
             return
@@ -298,7 +282,7 @@ class Chunk:
         self.rounds.append(Round("skip", proposer, drafted=drafted, accepted=size, committed=size))
 
     def until_end(self, tokens: Sequence[int]) -> list[int]:
-        """Return the tokens up to and including the first end token. If there is no end token, return all tokens."""
+        """Return the tokens up to and including the first end token."""
         found, end = list(tokens), self.space.end
         return found[: found.index(end) + 1] if end is not None and end in found else found
 
@@ -307,10 +291,6 @@ class Chunk:
 
         The robot executes these values without rounding. If decoding continues, the target reads the tokens that are
         nearest to these values.
-
-        Args:
-            found: What the rectifier predicted.
-            with_target_token: Whether the target's token at the rejected position stays committed.
         """
         if not with_target_token:
             del self.tokens[-1]
@@ -341,9 +321,7 @@ class Chunk:
         values.flat[list(self.filled)] = list(self.filled.values())
         return values
 
-    def record(
-        self, actions: np.ndarray, seconds: float, phases: dict[str, float], similarity: float | None = None
-    ) -> DecodeRecord:
+    def record(self, actions: np.ndarray, seconds: float, phases: dict[str, float]) -> DecodeRecord:
         """Return the record of the complete chunk. The arguments become the record's attributes of the same names."""
         return DecodeRecord(
             tokens=tuple(self.tokens),
@@ -358,7 +336,7 @@ class Chunk:
             filled=tuple(self.filled),
             variability=self.variability,
             skipped=any(one.mode == "skip" for one in self.rounds),
-            similarity=similarity,
+            similarity=self.similarity,
             metric=self.choice.metric if self.choice is not None else None,
             reason=self.reason,
         )
@@ -368,7 +346,6 @@ def deviation(space: ActionSpace, actions: np.ndarray, autoregressive: np.ndarra
     """Return the mean absolute difference between two chunks of actions, in normalised action units.
 
     Args:
-        space: The action space.
         actions: The method's actions (h, D), environment units.
         autoregressive: The actions of autoregressive decoding (H, D), environment units. Only the first h ≤ H are
             compared.
@@ -382,11 +359,6 @@ def check_tokens(tokens: np.ndarray, vocabulary: int, proposer: str) -> None:
 
     Args:
         tokens: (n,) integers.
-        vocabulary: Number of action tokens.
-        proposer: Name of the proposer, for the error message.
-
-    Raises:
-        KervError: A token is negative, or not below `vocabulary`.
     """
     if tokens.size and not (tokens.min() >= 0 and tokens.max() < vocabulary):
         wrong = next(token for token in tokens.tolist() if not 0 <= token < vocabulary)

@@ -34,15 +34,6 @@ class TokenTree:
 
     @classmethod
     def build(cls, tokens: Sequence[int], parents: Sequence[int] | None = None) -> TokenTree:
-        """Build a tree, and compute the depths.
-
-        Args:
-            tokens: Token of each node.
-            parents: Index of each node's parent, −1 for the last committed token. None builds a chain.
-
-        Raises:
-            ValueError: A parent does not come before its child.
-        """
         n = len(tokens)
         if parents is None:
             return cls(tuple(tokens), tuple(range(ROOT, n - 1)), tuple(range(n)))
@@ -58,7 +49,6 @@ class TokenTree:
 
     @property
     def levels(self) -> int:
-        """Number of nodes on the longest path. 0 for a chain, which has no branches."""
         depth = max(self.depths, default=-1) + 1
         return depth if depth < len(self) else 0
 

@@ -88,12 +88,6 @@ class Parts:
     boundary: Boundary | None = None  # chooses between retrieval and drafter
     skip: Skip | None = None  # may execute a draft without verification
 
-    def similarity(self, chunk: Chunk) -> float | None:
-        """Return the cosine of the best match in the datastore. None if no part searched for this chunk."""
-        parts = filter(None, (self.skip, self.prefill_draft, self.proposer))
-        found = [part.similarity(chunk) for part in parts]
-        return next((one for one in found if one is not None), None)
-
 
 class Verified(NamedTuple):
     """Result of one verification, a forward of the target over a draft of n nodes.
@@ -117,16 +111,6 @@ class Decoder(Follower):
     """Decodes chunks of actions with one target and one method, one episode at a time."""
 
     def __init__(self, target: Target, parts: Parts | None = None, chunk: int = 0) -> None:
-        """Build the decoder and its cache.
-
-        Args:
-            target: The policy that decodes and verifies.
-            parts: The method's parts. If None, the target decodes autoregressively.
-            chunk: H, number of control steps to decode at once. If 0, the number that the target was trained for.
-
-        Raises:
-            UsageError: `chunk` is negative, or larger than the number that the target was trained for.
-        """
         super().__init__(target.actions, target.cameras)
         self.target, self.parts = target, parts or Parts()
         self.predicts = target if isinstance(target, PredictsTokens) else None
@@ -142,17 +126,9 @@ class Decoder(Follower):
 
     @functools.cached_property
     def autoregressive(self) -> Decoder:
-        """An autoregressive decoder of the same target. Its actions are compared with the method's."""
         return Decoder(self.target, chunk=self.steps)
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
-        """Start a new episode.
-
-        Args:
-            task: Name of the task.
-            seed: Seed of the episode, for parts that draw random numbers.
-            end_effector: Initial position (3,), metres.
-        """
         super().reset(task, seed, end_effector)
         self.decodes = 0
         parts = self.parts
@@ -165,7 +141,6 @@ class Decoder(Follower):
             parts.skip.begin(task, seed)
 
     def finish(self, success: bool) -> None:
-        """End the episode. `success` says whether the task was solved."""
         if self.parts.skip is not None:
             self.parts.skip.finish(success)
 
@@ -190,7 +165,7 @@ class Decoder(Follower):
         self.threshold.update(variability(chunk.rounds, self.space, self.threshold.measure))
         if self.parts.rectifier is not None:
             self.parts.rectifier.next_decode()
-        record = chunk.record(actions, stopwatch.stop(), stopwatch.phases, self.parts.similarity(chunk))
+        record = chunk.record(actions, stopwatch.stop(), stopwatch.phases)
         self.decodes += 1
         if not self.deviation_every or self.decodes % self.deviation_every:
             return record
@@ -291,13 +266,7 @@ class Decoder(Follower):
         return torch.cat(tokens[1:]).tolist()
 
     def propose(self, chunk: Chunk, proposer: Proposer | None, stopwatch: Stopwatch) -> Draft:
-        """Return the proposer's draft. The draft is empty if there is no proposer or only one token is left to decode.
-
-        A draft is at most `remaining − 1` tokens deep, because the target itself gives the chunk's last token.
-
-        Raises:
-            KervError: The draft cannot be verified, see `Draft.check`.
-        """
+        """Return a draft of at most `remaining − 1` tokens per path: the target itself gives the chunk's last token."""
         if proposer is None or chunk.remaining < 2:
             return EMPTY
         depth = chunk.remaining - 1
@@ -377,13 +346,7 @@ class Decoder(Follower):
         return self._keep(chunk, verified, list(path))
 
     def _keep(self, chunk: Chunk, verified: Verified, rows: list[int]) -> Tensor:
-        """Remove rejected draft tokens from the cache. Return the hidden states of all other tokens of the forward.
-
-        Args:
-            chunk: The chunk, whose cache is changed.
-            verified: Result of the verification.
-            rows: Indices of the accepted nodes.
-        """
+        """Remove rejected draft tokens from the cache. Return the hidden states of all other tokens of the forward."""
         cache, hidden = chunk.target.cache, verified.hidden
         end, before = cache.length - len(verified.tree), hidden.shape[1] - len(verified.tree)
         if rows == list(range(len(rows))):  # the first nodes of a chain are already in their slots
@@ -394,18 +357,10 @@ class Decoder(Follower):
         return torch.cat([hidden[:, :before], hidden[:, before + kept]], 1)
 
     def rectify(self, chunk: Chunk, hidden: Tensor, stopwatch: Stopwatch) -> Tensor:
-        """After a rejection, let the rectifier predict the missing values of the rejected token's control step.
+        """After a rejection, let the rectifier predict what is missing of the rejected token's control step.
 
-        If the rectifier filled several values and the chunk is not complete, the target reads their tokens in one more
-        forward, which also gives the next token.
-
-        Args:
-            chunk: The chunk that is decoded.
-            hidden: The target's hidden states of this round, from `commit`.
-            stopwatch: Measures the phases.
-
-        Returns:
-            `hidden`, followed by the hidden states of the additional forward, if there was one.
+        If it filled several values and the chunk is not complete, the target reads their tokens in one more forward,
+        which also gives the next token. Returns `hidden`, followed by the hidden states of that forward.
         """
         last, rectifier = chunk.rounds[-1], self.parts.rectifier
         if rectifier is None or last.accepted == len(last.drafted):
@@ -430,14 +385,12 @@ class BatchDecoder:
     """
 
     def __init__(self, decoder: Decoder) -> None:
-        """Use the target and the method of `decoder`. `Method.check` tests whether the method can be batched."""
         self.decoder, self.target = decoder, decoder.target
         self.limits = decoder.acceptance.limits(decoder.threshold.radius())
         self.skip, self.size = decoder.parts.skip, decoder.target.actions.longest(decoder.steps)
         self._caches: dict[int, Cache] = {}
 
     def new_episode(self) -> Follower:
-        """Return a `Follower` for one more episode of the batch."""
         return Follower(self.target.actions, self.target.cameras)
 
     @torch.inference_mode()
@@ -465,24 +418,16 @@ class BatchDecoder:
                     chunk.commit_token(token)
         for chunk in chunks:
             chunk.episode.last = chunk.tokens
-        similarity = self.decoder.parts.similarity
-        return [chunk.record(chunk.actions(), math.nan, dict(UNTIMED), similarity(chunk)) for chunk in chunks]
+        return [chunk.record(chunk.actions(), math.nan, dict(UNTIMED)) for chunk in chunks]
 
     def _encode(self, observations: Sequence[Observation]) -> list[Tensor]:
-        """Return each prompt's embeddings (1, P, E).
-
-        On a CPU the observations are encoded one by one, because kerv's compiled encoders are faster that way.
-        """
+        """Encode one by one on a CPU, because kerv's compiled encoders are faster that way. Each is (1, P, E)."""
         if isinstance(self.target, EncodesMany) and self.target.device.type != "cpu":
             return list(self.target.encode_many(observations).split(1))
         return list(map(self.target.encode, observations))
 
     def _cache(self, rows: int) -> Cache:
-        """Return an empty cache for `rows` sequences.
-
-        The last cache is used again if it has this number of sequences. Otherwise a new cache replaces it. The number
-        of sequences often changes, and keeping a cache for each number would fill the memory.
-        """
+        """Return an empty cache for `rows` sequences. Only the last one is kept: their number often changes."""
         if rows not in self._caches:
             self._caches = {rows: self.target.new_cache(rows, self.target.max_prompt + self.size)}
         self._caches[rows].length = 0
@@ -494,7 +439,6 @@ def greedy(target: Target, prompt: Tensor, cache: Cache | None = None, size: int
     """Decode a batch of prompts autoregressively.
 
     Args:
-        target: The policy.
         prompt: The prompts' embeddings (B, P, E).
         cache: An empty cache with room for P + N tokens. If None, a new cache is made.
         size: N, number of tokens to decode. If 0, the largest number that a chunk of the target can have.

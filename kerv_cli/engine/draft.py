@@ -39,32 +39,13 @@ class Draft:
 
     @classmethod
     def of(cls, tokens: Sequence[int], parents: Sequence[int] | None = None) -> Draft:
-        """Build a draft on the CPU.
-
-        Args:
-            tokens: The n tokens.
-            parents: Index of each token's parent, −1 for the last committed token. None for a chain.
-        """
+        """Build a draft on the CPU."""
         return cls(_vector(tokens), None if parents is None else _vector(parents))
 
     def __len__(self) -> int:
         return self.tokens.shape[0]
 
     def check(self, vocabulary: int, proposer: str, depth: int) -> None:
-        """Raise an error if the draft cannot be verified.
-
-        Tokens on the GPU are not checked: each is an argmax, which is always in range. The depth of a tree on the GPU
-        is taken from `levels`.
-
-        Args:
-            vocabulary: Number of action tokens.
-            proposer: Name of the proposer, for the error messages.
-            depth: Maximum number of tokens on a path.
-
-        Raises:
-            KervError: A token is out of range, a path is too long, a parent does not come before its child, a tree on
-                the GPU has no `levels`, or tokens and parents are on different devices.
-        """
         device, reached = self.tokens.device, len(self)
         if device == HOST:
             check_tokens(self.tokens.numpy(), vocabulary, proposer)
@@ -87,20 +68,14 @@ class Draft:
 
     @cached_property
     def tree(self) -> TokenTree:
-        """The draft as a tree. Only for drafts on the CPU."""
         return TokenTree.build(self.tokens.tolist(), None if self.parents is None else self.parents.tolist())
 
     @property
     def remote(self) -> list[Tensor]:
-        """The tensors among `tokens` and `parents` that are on the GPU, in this order. Empty for drafts on the CPU."""
         return [x for x in (self.tokens, self.parents) if x is not None and x.device != HOST]
 
     def judged(self, remote: Sequence[np.ndarray]) -> TokenTree:
-        """Return the draft as a tree on the CPU, for an acceptance rule.
-
-        Args:
-            remote: Copies, on the CPU, of the tensors in `Draft.remote`. Empty for a draft on the CPU.
-        """
+        """Return the draft as a tree on the CPU, for an acceptance rule."""
         return TokenTree.build(*(vector.astype(np.int64).tolist() for vector in remote)) if remote else self.tree
 
     def tokens_after(self, committed: list[int], device: torch.device) -> Tensor:
@@ -125,14 +100,7 @@ class Draft:
         return None if parents == list(range(ROOT, len(self) - 1)) else ancestors_of(parents)
 
     def positions(self, start: int, before: int, device: torch.device) -> Tensor:
-        """Return the positions (before + n,) of all tokens of a verification, for the target's positional encoding.
-
-        Args:
-            start: Position of the first of these tokens.
-            before: Number of tokens that are forwarded before the draft: the prompt's, or the committed tokens that are
-                not in the cache yet.
-            device: Where the tensor goes.
-        """
+        """Return the positions (before + n,) of all tokens of a verification, for the target's positional encoding."""
         stop, seen = start + before, self.ancestors
         if seen is None:
             return torch.arange(start, stop + len(self), device=device)
@@ -145,9 +113,6 @@ class Draft:
         """Return the attention mask of a verification, (before + n, before + n) bool. None if attention is causal.
 
         Entry [i, j] says whether token i of the forward attends to token j.
-
-        Args:
-            before: Number of tokens that are forwarded before the draft. Their attention is causal.
         """
         seen, size = self.ancestors, before + len(self)
         if seen is None:
@@ -181,7 +146,6 @@ def ancestors_on_device(parents: Tensor, levels: int) -> Tensor:
 
     Args:
         parents: Index of each token's parent, (n,), on the GPU.
-        levels: Maximum depth of the tree.
     """
     n, nodes = parents.shape[0], torch.arange(parents.shape[0], device=parents.device)
     reached = ((parents[:, None] == nodes) | (nodes[:, None] == nodes)).float()
@@ -194,10 +158,6 @@ def upload(numbers: ArrayLike, device: torch.device) -> Tensor:
     """Return integers as a tensor on the device, without waiting for the copy.
 
     On CUDA the copy is made from pinned memory, which PyTorch's allocator keeps until the copy is done.
-
-    Args:
-        numbers: An array, or a nested list.
-        device: Where the tensor goes.
     """
     host = torch.from_numpy(np.asarray(numbers))  # five times as fast as torch.as_tensor for a list
     if device.type == "cpu":
@@ -209,10 +169,6 @@ def upload(numbers: ArrayLike, device: torch.device) -> Tensor:
 
 def read(*parts: Tensor) -> list[np.ndarray]:
     """Copy several vectors from one device to the CPU in a single transfer, and wait for it.
-
-    Args:
-        parts: Vectors, which may have different lengths. If their types differ, all are returned as float64. Tokens and
-            indices stay exact, because they are small.
 
     Returns:
         One array per vector.

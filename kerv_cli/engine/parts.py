@@ -37,10 +37,6 @@ class Buildable(ABC):  # noqa: B024 - its subclasses are the interfaces
         """
         return cls(settings, context)
 
-    def similarity(self, chunk: Chunk) -> float | None:
-        """Return the cosine of the best match in the datastore. None if this part did not search for this chunk."""
-        return None
-
 
 class Threshold(Buildable):
     """Chooses the acceptance radius r of every decode (docs/methods.md §3.2).

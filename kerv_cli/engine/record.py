@@ -57,17 +57,12 @@ class Round:
 
     @property
     def drafter(self) -> str:
-        """Name of the proposer that drafted, or "" if no proposer drafted.
-
-        If the round's mode is "skip" or "parallel", this is the mode instead.
-        """
         if self.mode in ("skip", PARALLEL):
             return self.mode
         return "" if self.proposer == "none" else self.proposer
 
     @property
     def is_verification(self) -> bool:
-        """Whether the target verified a draft in this round."""
         return self.tree_size > 0 and self.mode != "skip"
 
 
@@ -122,7 +117,6 @@ class DecodeRecord:
 
     @property
     def unverified(self) -> int:
-        """Number of action values that the target did not verify, of all steps × D values of `actions`."""
         return self.unverified_among(0, len(self.actions))
 
     def unverified_among(self, first: int, end: int) -> int:
@@ -139,15 +133,10 @@ class DecodeRecord:
 
     @property
     def verifications(self) -> int:
-        """Number of rounds in which the target verified a draft."""
         return sum(r.is_verification for r in self.rounds)
 
     @property
     def first_rejected(self) -> int | None:
-        """Index in the chunk of the first token that the first verification rejected.
-
-        N if that verification rejected no token. None if the decode had no verification.
-        """
         for r in self.rounds:
             if r.is_verification:
                 return r.start + r.accepted if r.accepted < len(r.drafted) else self.size or len(self.tokens)
@@ -167,11 +156,6 @@ def variability(rounds: Sequence[Round], space: ActionSpace, measure: str = MEAN
     """Return the kinematic variability K: how far a decode's drafts were from the target's tokens.
 
     Strict DoFs, such as a gripper, are left out, because one wrong gripper token would outweigh all other differences.
-
-    Args:
-        rounds: The rounds of the decode.
-        space: The action space.
-        measure: One of MEASURES.
 
     Returns:
         K in normalised action units. None if no draft token counts, or if tokens have no distance.
@@ -225,12 +209,10 @@ class EpisodeRecord:
 
     @property
     def timed(self) -> bool:
-        """Whether the decodes have times. They have none if several episodes were decoded at once."""
         return not math.isnan(self.seconds)
 
     @property
     def executed(self) -> list[tuple[int, int]]:
-        """For each decode, the range of its actions that were executed: the first one, and the one after the last."""
         found, begins = [], [*self.decode_steps[1:], self.steps]
         for decode, step, following in zip(self.decodes, self.decode_steps, begins, strict=True):
             first = decode.delay.dropped if decode.delay else 0
@@ -239,7 +221,6 @@ class EpisodeRecord:
 
     @property
     def forwards(self) -> int:
-        """Number of forward passes of the target."""
         return sum(d.forwards for d in self.decodes)
 
     @property
@@ -249,6 +230,5 @@ class EpisodeRecord:
 
     @property
     def jerk(self) -> float:
-        """Root mean square of the end effector's jerk, m/s³; NaN if the episode has fewer than 3 steps."""
         third = np.diff(self.path.astype(np.float64), n=3, axis=0) * self.space.control_hz**3
         return float(np.sqrt((third**2).sum(axis=1).mean())) if len(third) else math.nan

@@ -61,23 +61,12 @@ class MadeFor:
 
     @classmethod
     def of(cls, target: TargetDescription) -> MadeFor:
-        """Return the hash, the action space and the chunk length from a target's description."""
         return cls(target.origin["sha256"], target.actions, target.chunk)
 
 
 def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str, again: str) -> None:
-    """Refuse an artifact that was made from other versions of the policy's target or artifacts.
-
-    Args:
-        sources: Hashes of the artifacts from which the artifact was made, by kind. Kinds that the policy does not use
-            are ignored.
-        used: Hashes of the policy's target and artifacts, by kind.
-        what: Beginning of the error message, such as `the early drafter in FOLDER was trained`.
-        again: What the user should do, for the error message, such as `run 'kerv calibrate' again`.
-
-    Raises:
-        CheckpointError: The policy uses an artifact of the same kind with another hash.
-    """
+    """Refuse an artifact that was made from other versions of the policy's target or artifacts (hashes by kind)."""
+    """Refuse an artifact that was made from other versions of the policy's target or artifacts."""
     for kind, digest in sources.items():
         if used.get(kind, digest) != digest:
             noun = kind if kind == TARGET else kind_of(kind).noun
@@ -108,7 +97,6 @@ class Artifact(Generic[T]):
     schema: type[T]
 
     def again(self, *words: str) -> str:
-        """Return advice for an error message: how to make such an artifact. `words` are further arguments."""
         return f"{self.advice} 'kerv {' '.join((*self.command, *words))}'"
 
     def anew(self, *words: str) -> str:
@@ -116,27 +104,13 @@ class Artifact(Generic[T]):
         return self.again(*words, "replace=true")
 
     def path(self, results: str, name: str | None, target: Path) -> Path:
-        """Return the path of an artifact.
-
-        Args:
-            results: The results folder.
-            name: Name of the artifact, or a path. If None, the artifact is beside the target.
-            target: Folder of the target.
-        """
         return artifact_or_path(results, self.kind, name) if name else beside(target, self.kind)
 
     def json(self, path: Path) -> Path:
-        """Return the path of the JSON file that describes the artifact in `path`."""
         return path / f"{self.kind}.json"
 
     def load(self, path: Path, artifacts: Artifacts) -> Any:
-        """Load the artifact in `path`, and check that it was made for the target of `artifacts`.
-
-        This base class returns only the checked description. A subclass returns what a method uses, such as a network.
-
-        Raises:
-            CheckpointError: The artifact is missing, damaged or made for another target.
-        """
+        """Load the artifact in `path`, after `checked`. A subclass returns what a method uses, such as a network."""
         return self.checked(path, artifacts.description)
 
     def made_for(self, description: T) -> MadeFor:
@@ -149,45 +123,25 @@ class Artifact(Generic[T]):
         return {}
 
     def check_use(self, description: T, use: Use) -> None:
-        """Refuse a use that the artifact was not made for. This base class allows every use.
-
-        Raises:
-            CheckpointError: The artifact lacks something that the method reads.
-        """
+        """Refuse a use for which the artifact lacks something. This base class allows every use."""
+        """Refuse a use that the artifact was not made for. This base class allows every use."""
 
     def is_complete(self, description: T, kinds: Collection[str]) -> bool:
-        """Return whether the artifact is complete, for a policy that also has artifacts of these `kinds`.
-
-        A calibration, for example, is incomplete if it was made before the policy got a datastore.
-        """
+        """Return whether it has all that a policy with artifacts of these `kinds` needs."""
         return True
 
     def digest(self, path: Path, description: T) -> str:
-        """Return a hash that identifies the artifact. This base class returns the hash of the description.
-
-        Stored episodes contain the hashes of the artifacts that they used.
-        """
+        """Return a hash that identifies the artifact. Stored episodes contain it."""
         return sha256_of(self.json(path))
 
     def read(self, path: Path) -> T:
-        """Read the description of the artifact in `path`, without checking which target it was made for.
-
-        Raises:
-            CheckpointError: The description is missing, damaged or of another format, or a file beside it does not have
-                the hash that the description names.
-        """
+        """Read the description of the artifact in `path`, for whatever target it was made."""
         file = self.json(path)
         if not file.is_file():
             raise CheckpointError(f"no {self.noun} in {path}: {self.again()}, or name a folder that holds one")
         return self.described(file)
 
     def described(self, file: Path) -> T:
-        """Read the description in an existing file.
-
-        Raises:
-            CheckpointError: The description is damaged or of another format, or a file beside it does not have the hash
-                that the description names.
-        """
         try:
             description = read_file(self.schema, file)
         except CheckpointError as error:
@@ -196,12 +150,7 @@ class Artifact(Generic[T]):
         return description
 
     def checked(self, path: Path, target: TargetDescription) -> T:
-        """Read the description of the artifact in `path`, and check that it was made for this target.
-
-        Raises:
-            CheckpointError: The artifact is missing or damaged, or was made for another target, action space,
-                normalisation or chunk length.
-        """
+        """Read the description of the artifact in `path`, and check that it was made for this target."""
         description = self.read(path)
         made, what, again = self.made_for(description), f"the {self.noun} in {path}", self.anew()
         made.actions.check_same(target.actions, what, "the target", statistics=True)
@@ -238,30 +187,19 @@ class Artifacts:
 
     @functools.cached_property
     def description(self) -> TargetDescription:
-        """The target's description. The weights are not loaded."""
         return checkpoint.read_target(self.folder)
 
     @property
     def target(self) -> Any:
-        """The loaded target: a `Target`, or for most families a `ReadableTarget` (`engine/protocol.py`)."""
         return _target(self.folder, self.description.sha256, self.device, self.dtype)
 
     def path(self, kind: str) -> Path:
-        """Return the path of the policy's artifact of this kind."""
         beside = Path(self.description.origin.get("base", self.folder))
         return kind_of(kind).path(self.results, self.policy.artifacts.get(kind), beside)
 
     def new(self, kind: str, adds: bool = False) -> Path:
-        """Return the path to which a command writes the policy's artifact of this kind.
-
-        Args:
-            kind: Kind of the artifact.
-            adds: Whether the command only adds to an existing artifact. This is allowed for a shipped policy, too.
-
-        Raises:
-            UsageError: `policy.artifacts.KIND` is a path, which no command writes to, or an artifact of a shipped
-                policy would be replaced.
-        """
+        """Return the path to which a command writes. `adds`: it only adds, which a shipped policy's artifact allows."""
+        """Return the path to which a command writes the policy's artifact of this kind."""
         name = self.policy.artifacts.get(kind)
         if name:
             check_name(name, f"policy.artifacts.{kind}:")
@@ -271,23 +209,10 @@ class Artifacts:
         return path
 
     def exists(self, kind: str) -> bool:
-        """Return whether the policy has an artifact of this kind."""
         return kind_of(kind).json(self.path(kind)).is_file()
 
     def check(self, kinds: Iterable[str], use: Use | None = None) -> dict[str, str]:
-        """Check artifacts without loading their weights.
-
-        Args:
-            kinds: Kinds of the artifacts.
-            use: The method and the world that the artifacts will be used in. If None, the use is not checked.
-
-        Returns:
-            The hashes, by kind, of the target and of the artifacts of `kinds`.
-
-        Raises:
-            CheckpointError: An artifact is missing, damaged, made for another target, or made from another version of
-                an artifact than the policy uses.
-        """
+        """Check artifacts without loading weights. Return the hashes, by kind, of the target and of these artifacts."""
         hashes, sources = {TARGET: self.description.sha256}, []
         for kind in dict.fromkeys(kinds):
             files, path = kind_of(kind), self.path(kind)
@@ -314,7 +239,6 @@ class Artifacts:
         return files.anew(*words)
 
     def _making(self, files: Artifact[Any]) -> str:
-        """Return the command that makes a missing artifact."""
         target, name = f"policy.target={self.policy.target}", self.policy.artifacts.get(files.kind)
         if name is None or "/" in name:
             return f"kerv prepare {target}"
@@ -322,11 +246,7 @@ class Artifacts:
         return command_of_a_study(word) or " ".join(("kerv", *files.command, target, word))
 
     def load(self, kind: str) -> Any:
-        """Load the policy's artifact of this kind. Further calls in this process return the same object.
-
-        Raises:
-            CheckpointError: The artifact is missing, damaged or made for another target.
-        """
+        """Load the policy's artifact of this kind. Further calls in this process return the same object."""
         path, digest = self.path(kind), self.check([kind])[kind]
         key = kind, path, digest, self.folder, self.device, self.dtype, repr(self.search)
         if key not in _LOADED:
@@ -335,11 +255,7 @@ class Artifacts:
 
 
 def kind_of(name: str) -> Artifact[Any]:
-    """Return the kind of artifact with this name, such as `drafter`.
-
-    Raises:
-        UnknownName: No kind of artifact has this name.
-    """
+    """Return the kind of artifact with this name, such as `drafter`."""
     kind: Artifact[Any] = ArtifactPart.find(name).built()
     return kind
 

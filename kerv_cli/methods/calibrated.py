@@ -8,7 +8,6 @@ from kerv_cli.base.registry import ArtifactPart
 # it has a section for a drafter and one for a datastore
 @ArtifactPart("calibration", needs=("drafter", "datastore"), by_task=True, needs_task=True)
 def artifact() -> type:
-    """Import and return the class that finds, checks and loads calibrations."""
     from kerv_cli.methods.calibration import CalibrationArtifact
 
     return CalibrationArtifact

@@ -148,19 +148,10 @@ class Calibration:
 
     @property
     def tasks(self) -> Collection[str]:
-        """Tasks for which the reference level K_S of the variability was measured."""
         return self.variability
 
     def k_s(self, task: str, measure: str = MEAN) -> float:
-        """Return the task's reference level K_S of the variability, in normalised action units.
-
-        Args:
-            task: Full name of the task.
-            measure: Way to compute K, one of `MEASURES`.
-
-        Raises:
-            CheckpointError: K_S was not measured for this task or this measure.
-        """
+        """Return the task's reference level K_S of the variability, in normalised action units."""
         if task not in self.variability:
             raise CheckpointError(
                 f"the calibration has no reference level K_S for {task}, only for "
@@ -175,11 +166,7 @@ class Calibration:
         return row.levels.get(measure, row.k_s)
 
     def ranges(self, window: int) -> BoundaryRanges:
-        """Return the ranges of radius of curvature and path length, for a boundary that sees `window` positions.
-
-        Raises:
-            CheckpointError: No ranges were measured for this window.
-        """
+        """Return the ranges of radius of curvature and path length, for a boundary that sees `window` positions."""
         if self.boundary is None:
             raise CheckpointError(f"the calibration has no ranges for the boundary: {AGAIN}")
         windows = self.boundary.windows
@@ -195,13 +182,6 @@ class Calibration:
 
         A skip rule may change s_min after each episode, between low and high. If the task never skips verification, all
         three numbers are NEVER, which is above every similarity.
-
-        Args:
-            task: Full name of the task.
-            datastore: Hash of the datastore that is in use.
-
-        Raises:
-            CheckpointError: The similarities were not measured, or not for this task or this datastore.
         """
         if self.skip is None:
             raise CheckpointError(f"the calibration has no skip levels: build a datastore, then {AGAIN}")
@@ -223,11 +203,6 @@ class CalibrationArtifact(Artifact[Calibration]):
     schema = Calibration
 
     def path(self, results: str, name: str | None, target: Path) -> Path:
-        """Return the path of the calibration with this name. Without a name, the calibration is beside the target.
-
-        A shipped calibration is `pretrained/<name>/calibration.json`. A calibration that `kerv calibrate` made is
-        `artifacts/calibration/<name>/calibration.json`.
-        """
         if name is None and target.name == "target":
             return target.parent / FILE
         if name is None and target.parent.name != "target":
@@ -235,22 +210,12 @@ class CalibrationArtifact(Artifact[Calibration]):
         return super().path(results, name, target) / FILE
 
     def json(self, path: Path) -> Path:
-        """Return `path`, because a calibration is its own description."""
         return path
 
     def sources(self, description: Calibration) -> Mapping[str, str]:
-        """Return the hash of the datastore that the skip levels were measured for. Empty if there are none."""
         return {"datastore": description.skip.datastore} if description.skip else {}
 
     def check_use(self, description: Calibration, use: Use) -> None:
-        """Refuse a method whose parts need numbers that were not measured.
-
-        A threshold may need K_S of a task (docs/methods.md §3.2). A boundary may need the quantiles of F, the weighted
-        sum of radius of curvature and path length (§4.4).
-
-        Raises:
-            CheckpointError: Such a number was not measured.
-        """
         threshold, boundary = use.method["threshold"], use.method["boundary"]
         if isinstance(boundary, FusedBoundarySettings) and boundary.f_star is None:
             description.ranges(boundary.window).limit(boundary.quantile, boundary.alpha)
@@ -259,14 +224,8 @@ class CalibrationArtifact(Artifact[Calibration]):
                 description.k_s(task, threshold.measure)
 
     def is_complete(self, description: Calibration, kinds: Collection[str]) -> bool:
-        """Return whether the calibration holds all numbers that a policy with artifacts of these `kinds` needs.
-
-        With a drafter, the reference levels K_S are needed. With a datastore, the thresholds s_min for skipping
-        verification are needed.
-        """
         sections = {"drafter": description.variability, "datastore": description.skip}
         return all(section for kind, section in sections.items() if kind in kinds)
 
     def made_for(self, description: Calibration) -> MadeFor:
-        """Return the hash, action space and chunk length of the target that the calibration was made for."""
         return description.target

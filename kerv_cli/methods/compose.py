@@ -35,16 +35,10 @@ class Method:
 
     @classmethod
     def of(cls, settings: MethodSettings) -> Method:
-        """Return the method that a command's settings describe."""
         return cls(settings.parts(), settings.chunk, settings.method)
 
     @functools.cached_property
     def parts(self) -> dict[str, registry.Part]:
-        """The registered parts, by kind, for all kinds in METHOD_KINDS.
-
-        Raises:
-            UnknownName: The settings name a part that does not exist.
-        """
         return {kind: registry.part_of(kind, self.settings[kind].kind) for kind in registry.METHOD_KINDS}
 
     @property
@@ -57,30 +51,18 @@ class Method:
 
     @property
     def prefill_draft(self) -> registry.ProposerPart:
-        """The registered proposer that drafts before the prefill."""
         return registry.ProposerPart.find(self.settings["prefill_draft"].kind, "prefill_draft.kind")
 
     @property
     def proposer(self) -> registry.ProposerPart:
-        """The registered proposer that drafts after the prefill."""
         return registry.ProposerPart.find(self.settings["proposer"].kind, "proposer.kind")
 
     @property
     def skip(self) -> registry.SkipPart:
-        """The part that executes drafts without verification."""
         return registry.SkipPart.find(self.settings["skip"].kind, "skip.kind")
 
     def check(self, target: Target | TargetDescription, batch: int = 1) -> None:
-        """Refuse parts that do not work together or with the target, and numbers out of range. Loads no weights.
-
-        Args:
-            target: A loaded target, or a target's description.
-            batch: Number of episodes that are decoded together.
-
-        Raises:
-            UnknownName: The settings name a part that does not exist.
-            UsageError: The parts cannot work together or with the target, or a number is out of range.
-        """
+        """Refuse parts that do not work together or with the target, and numbers out of range. Loads no weights."""
         from kerv_cli.engine.chunk import chunk_steps  # imports numpy, which a mistyped key must not wait for
 
         for kind in self.parts:
@@ -124,11 +106,6 @@ class Method:
             self._check_batch(batch)
 
     def _check_batch(self, batch: int) -> None:
-        """Check that the method can decode several episodes together.
-
-        Raises:
-            UsageError: The method decodes only one episode at a time. The message names the method or its threshold.
-        """
         draft, skip = self.prefill_draft, self.skip
         threshold = registry.ThresholdPart.find(self.settings["threshold"].kind)
         is_used = draft.absent or skip.takes_draft
@@ -140,17 +117,8 @@ class Method:
             raise UsageError(f"rollout.batch={batch}: threshold={threshold.name} follows one episode. Use another")
 
     def decoder(self, target: Target, artifact: Callable[[str], Any], task: str = "") -> Decoder:
-        """Build the decoder of this method for a target.
-
-        Args:
-            target: The policy that verifies drafts.
-            artifact: Returns the loaded artifact of a kind. Called only for the kinds in `needs`.
-            task: Full name of the task, for parts that have calibrated numbers per task.
-
-        Raises:
-            UsageError: The parts cannot work together or with the target, or a number is out of range.
-            CheckpointError: An artifact is missing or belongs to another target.
-        """
+        """Build the decoder. `artifact` returns the loaded artifact of a kind, for the kinds in `needs` alone."""
+        """Build the decoder of this method for a target."""
         from kerv_cli.engine.decoder import Decoder, Parts
 
         self.check(target)

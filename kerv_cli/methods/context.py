@@ -33,5 +33,4 @@ class Context:
 
     @property
     def calibration(self) -> Any:
-        """The policy's `Calibration`. The type is Any to avoid a circular import."""
         return self.artifact("calibration")

@@ -34,12 +34,6 @@ class MergedProposerSettings:
     neighbours: int = number(1, 1, MOST_TOKENS)  # if retrieval drafts: number of stored chunks
 
     def check_together(self, prefix: str) -> None:
-        """Refuse empty `sources`, and proposers that cannot draft whole chunks before the prefill.
-
-        Raises:
-            UsageError: `sources` is empty, or a proposer cannot draft whole chunks before the prefill.
-            UnknownName: A proposer does not exist.
-        """
         if not self.sources:
             raise UsageError("merged: name at least one of sources")
         for name in (*self.sources, *self.fallback):
@@ -80,8 +74,6 @@ class MergedProposer(ChainProposer):
 
     @classmethod
     def build(cls, settings: MergedProposerSettings, context: Context) -> MergedProposer:
-        """Build the part that the setting `prefill_draft=merged` or `proposer=merged` chooses."""
-
         def source(name: str) -> ChainProposer:
             part = ProposerPart.find(name)
             source_settings = part.default
@@ -92,20 +84,10 @@ class MergedProposer(ChainProposer):
         return cls([*map(source, settings.sources)], settings.nodes, [*map(source, settings.fallback)])
 
     def reset(self) -> None:
-        """Begin an episode, for all proposers."""
         for source in (*self.sources, *self.fallback):
             source.reset()
 
-    def similarity(self, chunk: Chunk) -> float | None:
-        """Return the cosine similarity of the most similar stored entry that one of the proposers found.
-
-        Return None if no proposer searched a datastore for this chunk.
-        """
-        found = [source.similarity(chunk) for source in (*self.sources, *self.fallback)]
-        return next((value for value in found if value is not None), None)
-
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """Return one prefix tree of all drafts, of at most `depth` tokens per path."""
         from kerv_cli.engine.draft import Draft
 
         chains = self.chains(chunk, depth)
@@ -116,10 +98,6 @@ class MergedProposer(ChainProposer):
         return Draft.of(tree.tokens, tree.parents)
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return the drafts of all sources, of at most `depth` tokens each.
-
-        The fallbacks draft, too, if no source expects its whole chunk to be accepted.
-        """
         sources = list(self.sources)
         if not any(source.is_sure(chunk) for source in sources):
             sources += self.fallback

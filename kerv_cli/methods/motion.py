@@ -22,15 +22,7 @@ if TYPE_CHECKING:
 
 
 def code_of(context: Context, part: str) -> FastCode:
-    """Return the target's FAST code, which turns tokens into the motion of a whole chunk.
-
-    Args:
-        context: The context in which a part is built.
-        part: The setting that needs a FAST code, such as `boundary=coarse`, for the error message.
-
-    Raises:
-        UsageError: The target has no FAST code. Each of its tokens stands for one number.
-    """
+    """Return the target's FAST code, which turns tokens into the motion of a whole chunk."""
     code = context.target.actions.code
     if code is None:
         raise UsageError(f"{part}: this target's tokens are bins; it is for a target with target.code=fast")
@@ -60,17 +52,11 @@ class MotionRule(DistanceRule):
 
     @classmethod
     def build(cls, settings: Any, context: Context) -> MotionRule:
-        """Check that the target decodes FAST tokens, and build the rule (`acceptance=motion`).
-
-        Raises:
-            UsageError: The target has no FAST code.
-        """
         code_of(context, "acceptance=motion")
         return cls(context.target.actions, settings.tolerance)
 
     @property
     def code(self) -> FastCode:
-        """The FAST code of the target's tokens."""
         assert self.space.code is not None
         return self.space.code
 
@@ -83,7 +69,6 @@ class MotionRule(DistanceRule):
         return self.code.motions(unit).reshape(unit.shape)
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """Return (0,), because FAST tokens have no distance to each other. The radius `r` is not used."""
         return (0,)
 
     def difference(self, before: Sequence[int], token: int, other: int) -> float:
@@ -101,11 +86,6 @@ class MotionRule(DistanceRule):
         return float(np.abs(gap @ self.basis[start:]).max(initial=0.0))
 
     def judge_after(self, tokens: Sequence[int], tree: TokenTree, target_tokens: Sequence[int], r: int) -> Accepted:
-        """Return the longest path of accepted draft tokens after the committed `tokens`. `r` is not used.
-
-        Of equally long paths the first wins. `target_tokens` holds the target's prediction after the last committed
-        token, then after each node of the tree.
-        """
         paths: dict[int, list[int]] = {ROOT: list(tokens)}  # tokens of the chunk up to each accepted node
         best = ROOT
         for node, (token, parent) in enumerate(zip(tree.tokens, tree.parents, strict=True)):
@@ -137,14 +117,8 @@ class Coarse(Boundary):
 
     @classmethod
     def build(cls, settings: Any, context: Context) -> Coarse:
-        """Check that the target decodes FAST tokens, and build the boundary (`boundary=coarse`).
-
-        Raises:
-            UsageError: The target has no FAST code.
-        """
         code_of(context, "boundary=coarse")
         return cls(settings, context)
 
     def choose(self, path: np.ndarray) -> Choice:
-        """Limit the number of tokens of the next chunk (setting `tokens`). The limit is fixed: `path` is not used."""
         return Choice("drafter", most=self.settings.tokens)

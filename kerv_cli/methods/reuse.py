@@ -44,25 +44,14 @@ class JacobiProposer(ChainProposer):
     guess: list[int]
 
     def begin(self, chunk: Chunk) -> None:
-        """Make the first guess, after the prefill."""
         tokens = chunk.rejection.target[: chunk.remaining]
         filler = chunk.space.tokens // 2 if chunk.space.end is None else chunk.space.end
         self.guess = [*tokens, *[filler] * (chunk.remaining - len(tokens))]
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return the current guess as one chain of at most `depth` tokens."""
         return [self.guess[: min(depth, self.settings.depth or depth)]]
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
-        """Make the next guess: this round's target tokens after the committed tokens, then the rest of the old guess.
-
-        Args:
-            chunk: The chunk that is decoded.
-            first: Index in the chunk of the token just before this round's tokens.
-            hidden: Not used.
-            target_tokens: The target's prediction after token `first`, then after each token of the guess, also
-                after rejected tokens.
-        """
         known = [*target_tokens, *self.guess[len(target_tokens) :]]  # of the places after token `first`
         self.guess = known[len(chunk.tokens) - first - 1 :]
 
@@ -87,7 +76,6 @@ class LookupProposer(ChainProposer):
     name = "lookup"
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return one chain of at most `depth` tokens. The chain is empty in an episode's first chunk."""
         last, tokens = chunk.episode.last, chunk.tokens
         for size in range(min(self.settings.longest, len(tokens)), 0, -1):
             places = [place for place in range(size, len(last)) if last[place - size : place] == tokens[-size:]]

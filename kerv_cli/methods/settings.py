@@ -47,5 +47,4 @@ class MethodSettings(RunSettings):
     datastore: Any = part("datastore", "exact", "how stored chunks are searched: exact, or a search of a plugin")
 
     def parts(self) -> dict[str, Any]:
-        """Return the settings of all parts of the method, by kind."""
         return {kind: getattr(self, kind) for kind in METHOD_KINDS}

@@ -41,11 +41,9 @@ class RelaxedRule(DistanceRule):
 
     @classmethod
     def build(cls, settings: Any, context: Context) -> RelaxedRule:
-        """Build the part that the setting `acceptance=relaxed` chooses."""
         return cls(context.target.actions, settings.strict_dofs)
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """Return the largest accepted distance of each of the D DoFs, in bins: r, or 0 for strict DoFs."""
         return self.same_limits(r, self.strict_dofs)
 
 

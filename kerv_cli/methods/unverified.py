@@ -41,11 +41,9 @@ class ParallelPass(Skip):
 
     @classmethod
     def build(cls, settings: NoSettings, context: Context) -> ParallelPass:
-        """Build the skip rule for a parallel target (`skip=parallel`)."""
         return cls(context.target)
 
     def take(self, chunk: Chunk) -> SkipDecision:
-        """Decode all tokens of the chunk in one forward of the target."""
         from kerv_cli.engine.record import PARALLEL
 
         hidden = self.target.parallel_pass(chunk.target.prompt, chunk.target.cache)
@@ -53,7 +51,6 @@ class ParallelPass(Skip):
 
 
 def native_decoder(target: Any) -> Decoder:
-    """Return a decoder without drafts. A parallel target decodes all tokens at once, any other target one by one."""
     from kerv_cli.engine.decoder import Decoder, Parts
 
     return Decoder(target, Parts(skip=ParallelPass(target)) if getattr(target, "parallel", False) else None)
@@ -90,7 +87,6 @@ class StreakSkip(Skip):
     """
 
     def __init__(self, settings: StreakSkipSettings, context: Context) -> None:
-        """Use the method's prefill draft. If it merges the drafts of several proposers, use only the first proposer."""
         from kerv_cli.methods.merged import MergedProposer
 
         draft = context.built["prefill_draft"]
@@ -100,14 +96,9 @@ class StreakSkip(Skip):
         self.chain: tuple[int, ...] = ()
 
     def begin(self, task: str, seed: int) -> None:
-        """Begin an episode. Its first `settings.opening` decodes may execute their drafts without verification."""
         self.allowed = self.left = self.settings.opening
 
     def take(self, chunk: Chunk) -> SkipDecision:
-        """Return the draft, to execute it unverified, if that is allowed now and the draft has all N tokens.
-
-        Otherwise return no tokens: the target decodes the chunk.
-        """
         chains = self.source.chains(chunk, chunk.size)
         self.chain = tuple(chains[0]) if chains else ()
         if not self.left or len(self.chain) < chunk.size:
@@ -116,11 +107,6 @@ class StreakSkip(Skip):
         return SkipDecision(self.chain, self.source.name, TRUSTED)
 
     def verified(self, chunk: Chunk) -> None:
-        """Double the number of decodes allowed without verification if the verified draft agrees; else set it to 0.
-
-        The draft agrees if it was accepted whole, or if its mean absolute difference from the target's tokens is at
-        most `tolerance`, in normalised action units. Tokens of strict DoFs, such as the gripper, must be equal.
-        """
         targets, tolerance, agrees = chunk.targets_along(self.chain), self.settings.tolerance, False
         if targets is not None:
             accepted = chunk.rounds[0].drafted[: chunk.rounds[0].accepted]
@@ -138,11 +124,9 @@ class AlwaysSkip(Skip):
 
     @classmethod
     def build(cls, settings: NoSettings, context: Context) -> AlwaysSkip:
-        """Build the skip rule, which executes the method's prefill drafts (`skip=always`)."""
         return cls(context.built["prefill_draft"])
 
     def take(self, chunk: Chunk) -> SkipDecision:
-        """Return the draft, to execute it unverified, if it has all N tokens. Otherwise return no tokens."""
         chains = self.source.chains(chunk, chunk.size)
         if not chains or len(chains[0]) < chunk.size:
             return SkipDecision()

@@ -37,7 +37,6 @@ class DrafterProposerSettings:
 
 
 def only_of_trees(settings: DrafterProposerSettings, *names: str) -> dict[str, str]:
-    """Return for each setting in `names` the reason why a chain ignores the setting. Empty if the shape is a tree."""
     return dict.fromkeys(names, "a chain is a single path") if settings.shape == "chain" else {}
 
 
@@ -52,7 +51,6 @@ def only_of_trees(settings: DrafterProposerSettings, *names: str) -> dict[str, s
     idle=lambda settings: only_of_trees(settings, "top_k", "nodes"),
 )
 def artifact() -> type:
-    """Import and return the class that trains and loads the artifact `drafter`, an EAGLE drafter."""
     from kerv_cli.methods.eagle.drafter import EagleDrafter
 
     return EagleDrafter

@@ -56,17 +56,12 @@ class EagleNetwork(DraftNetwork, LayerStack):
         self.fuse = nn.Linear(2 * width, width)
 
     def enter(self, *inputs: Tensor) -> Tensor:
-        """Map the embeddings of the next tokens and the hidden states, each (B, T, E), to the first layer's input."""
         return self.fuse(torch.cat(inputs, -1))
 
     def joined(self, target: Any, tree: bool) -> Any:
         """Return a compiled program that drafts level after level, with the target's embeddings and head.
 
         Return None if this drafter or the target is not compiled.
-
-        Args:
-            target: The target.
-            tree: Whether the program drafts trees (`Program.grow`), not chains (`Program.repeat`).
         """
 
         def step(hidden: Any) -> Tensor:
@@ -101,25 +96,15 @@ class DrafterProposer(Proposer):
         self.compiled = drafter.joined(target, top_k > 1) if isinstance(drafter, EagleNetwork) else None
 
     def begin(self, chunk: Chunk) -> None:
-        """Let the drafter read the prompt: run it over the prompt's embeddings and the prefill's hidden states."""
         hidden = chunk.target.hidden
         assert hidden is not None, "the prefill comes first"
         self.observe(torch.cat([chunk.target.prompt[:, 1:], self.embed(chunk.tokens)], 1), hidden, 0)
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """Return a chain, or a dynamic tree if `top_k` is above 1, of at most `depth` tokens per path."""
         depth = min(self.depth, depth)
         return Draft(self.chain(min(depth, self.nodes))) if self.top_k == 1 else self.tree(depth)
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
-        """Let the drafter read the newly committed tokens: run it over their embeddings and the target's hidden states.
-
-        Args:
-            chunk: The chunk that is decoded.
-            first: Index in the chunk of the token just before this round's tokens. `hidden` starts with this token.
-            hidden: (1, T, E) the target's hidden states of the chunk's tokens first … first + T − 1.
-            target_tokens: Not used.
-        """
         self.observe(self.embed(chunk.tokens[first + 1 :]), hidden, chunk.target.prompt_length + first)
 
     def embed(self, tokens: list[int]) -> Tensor:
@@ -127,15 +112,6 @@ class DrafterProposer(Proposer):
         return self.target.embed(upload([tokens], self.target.device))
 
     def observe(self, following: Tensor, hidden: Tensor, first: int) -> None:
-        """Run the drafter over hidden states of the target, so that the next draft begins after them.
-
-        The last draft's tokens are removed from the drafter's cache.
-
-        Args:
-            following: (1, T, E) embedding of the token after each position.
-            hidden: (1, T, E) the target's hidden states at the positions first, first + 1, …
-            first: The position of the first hidden state, counted from the prompt's beginning.
-        """
         self.cache.length = first
         positions = torch.arange(first, first + hidden.shape[1], device=hidden.device)
         self.hidden = self.drafter(following, hidden, positions, self.cache)[0, -1]
@@ -198,7 +174,6 @@ class DrafterProposer(Proposer):
 
 
 def _most(scores: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return the `count` highest scores in the last dimension, and their indices. Of equal scores the first wins."""
     values, indices = scores.sort(dim=-1, descending=True, stable=True)
     return values[..., :count], indices[..., :count]
 
@@ -239,11 +214,9 @@ class EagleDrafter(TrainableDrafter):
     any_chunk = True
 
     def network(self, settings: DrafterSettings, target: ReadableTarget) -> EagleNetwork:
-        """Return a network with initial weights, of the target's width, heads and feed-forward width."""
         return EagleNetwork(settings, target.width, target.heads, target.feed_forward)
 
     def load(self, path: Path, artifacts: Artifacts) -> EagleNetwork | PublicDrafter:
-        """Load the network for inference, in our own layout or the published one."""
         description: Any = self.checked(path, artifacts.description)
         target = artifacts.target
         if description.public is not None:
@@ -255,13 +228,6 @@ class EagleDrafter(TrainableDrafter):
 
     @classmethod
     def proposer(cls, settings: Any, context: Context) -> DrafterProposer:
-        """Build the proposer for `proposer=drafter`, or the one that the proposer `hybrid` contains.
-
-        The settings of both proposers have the fields shape, depth, top_k and nodes.
-
-        Raises:
-            UsageError: A node of the tree would have more children than there are action tokens.
-        """
         tokens = context.target.actions.tokens
         if settings.shape == "tree" and settings.top_k > tokens:
             raise UsageError(f"proposer.top_k={settings.top_k}: the target has only {tokens} action tokens")
@@ -271,7 +237,6 @@ class EagleDrafter(TrainableDrafter):
     def decoded(
         self, target: Any, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace, columns: dict[str, Tensor]
     ) -> EagleExamples:
-        """Decode observations of an episode, and keep their prompts and the target's hidden states."""
         lengths, kept = [], []
         for prompt in prompts_of(target, observations_of(target, episode, steps, space)):
             tokens, hidden = greedy(target, prompt)
@@ -284,7 +249,6 @@ class EagleDrafter(TrainableDrafter):
     def loss(
         self, network: EagleNetwork, target: Any, batch: EagleExamples, step: int, settings: Any
     ) -> tuple[Tensor, Metrics]:
-        """Return the mean loss over the drafter's passes (see `unrolled`), and the token loss of each pass to log."""
         losses: list[Tensor] = []
         metrics: Metrics = {}
         for length in batch.lengths.unique().tolist():
@@ -302,13 +266,6 @@ class EagleDrafter(TrainableDrafter):
         The first pass reads the target's hidden states. Each later pass reads the drafter's own predictions of the pass
         before, as in drafting. The loss of a pass is the weighted sum of two losses: the smooth L1 loss of the states,
         and the cross-entropy of the drafter's token distribution with the target's. The result is the mean over passes.
-
-        Args:
-            network: The drafter.
-            target: The target.
-            rows: The B training examples.
-            length: Number of prompt tokens of each of these examples.
-            settings: Settings of the drafter.
         """
         device = target.device
         tokens = rows.tokens.to(device)
@@ -338,11 +295,6 @@ class EagleDrafter(TrainableDrafter):
         return total / settings.unroll, metrics
 
     def validate(self, network: EagleNetwork, target: Any, held_out: EagleExamples, settings: Any) -> Metrics:
-        """Decode held-out observations. Return the acceptance lengths with strict and relaxed (r = 9) acceptance.
-
-        The acceptance length is the number of tokens committed per verification. The score is the sum of both lengths.
-        The network drafts in the target's number format, as it does in use.
-        """
         chosen = torch.linspace(0, len(held_out) - 1, min(VALIDATED, len(held_out))).long().tolist()
         prompts = [held_out.prompt[i, : held_out.lengths[i]][None].to(target.device, target.dtype) for i in chosen]
         loaded = copy.deepcopy(network).to(target.dtype)
@@ -354,8 +306,6 @@ def acceptance_length(target: Target, network: EagleNetwork, prompts: list[Tenso
     """Return the acceptance length: tokens committed per verification (docs/methods.md §7).
 
     Args:
-        target: The target.
-        network: The drafter. It drafts chains of up to 5 tokens.
         prompts: Encoded prompts to decode, each (1, P, E).
         r: Acceptance radius, in bins. Tokens of strict DoFs, such as the gripper, must equal the target's.
     """

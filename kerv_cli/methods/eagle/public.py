@@ -87,16 +87,14 @@ class DraftNetwork(nn.Module):
         cache: Cache | None = None,
         seen: np.ndarray | Tensor | None = None,
     ) -> Tensor:
-        """Return the predicted hidden states at the next positions, (B, T, E).
+        """Return the predicted hidden states (B, T, E) at the next positions.
 
         Args:
             following: (B, T, E) embedding of the token after each position.
-            hidden: (B, T, E) hidden state at each position.
+            hidden: (B, T, E) hidden states at the positions.
             positions: (T,) rotary positions.
-            cache: Keys and values of earlier positions. If it is empty, `hidden` must have the states of the whole
-                prompt. None if there are no earlier positions.
-            seen: (T, M) bool, which of the last M keys each query sees. If None, a query sees all keys up to its own
-                position.
+            cache: Keys and values of earlier tokens. If None, there are none.
+            seen: Attention mask (T, M) bool over the last M tokens. If None, attention is causal.
         """
         return self.run((following, hidden), positions, cache, seen)
 
@@ -112,7 +110,6 @@ class PublicDrafter(DraftNetwork):
         self.layers = nn.ModuleList(LlamaLayer(language, normed=i > 0) for i in range(language.num_hidden_layers))
 
     def new_cache(self, batch: int, capacity: int) -> DraftCache:
-        """Return an empty cache for at most `capacity` tokens of each of `batch` sequences."""
         weight = self.fc.weight
         return DraftCache(*self.shape.language.cache_sizes(batch, capacity), weight, weight.is_cuda)
 
@@ -135,16 +132,7 @@ class PublicDrafter(DraftNetwork):
 
 
 def read_public(folder: Path, target: ReadableTarget, convention: Convention) -> PublicDrafter:
-    """Read a published drafter, without its copy of the target's embeddings. The weights keep their number format.
-
-    Args:
-        folder: Folder with `config.json` and `model.safetensors`.
-        target: The target for which the drafter drafts.
-        convention: How the drafter differs from our own.
-
-    Raises:
-        CheckpointError: The folder is incomplete, damaged or pickled, or the drafter has another width than the target.
-    """
+    """Read a published drafter, without its copy of the target's embeddings. The weights keep their number format."""
     config, pickled = folder / CONFIG, folder / "pytorch_model.bin"
     language = read(Language, read_json(config), str(config), tolerant=True)
     if not (folder / WEIGHTS).is_file() and pickled.is_file():

@@ -31,7 +31,6 @@ class EarlySettings:
     any_code=True,
 )
 def early() -> type:
-    """Import and return the class that trains and loads the artifact `early`, the early drafter."""
     from kerv_cli.methods.early.drafter import EarlyDrafter
 
     return EarlyDrafter

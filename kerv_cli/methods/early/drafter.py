@@ -50,7 +50,6 @@ class Block(nn.Module):
         nn.init.zeros_(self.down.weight)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map features (B, W) to features (B, W)."""
         gate, up = self.gate_up(self.norm(x)).chunk(2, -1)
         return x + self.down(F.silu(gate) * up)
 
@@ -78,7 +77,6 @@ class EarlyNetwork(Compilable):
         self.head = nn.Linear(settings.rank, actions.tokens)
 
     def new_program(self) -> Program:
-        """Return the compiled network."""
         return Program(self.logits, (1, len(self.mean)))
 
     def standardise(self, features: Tensor) -> None:
@@ -139,17 +137,6 @@ def choose(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tensor, Tensor]
 
 
 def _between(below: Tensor, pad: int, radius: int, bins: int) -> Tensor:
-    """Return, for each bin, the summed probability of the bins that are at most `radius` bins away.
-
-    Args:
-        below: (…, V + 2 pad + 1) cumulative probability over the bins, padded on both sides.
-        pad: Padding of `below`, at least `radius`.
-        radius: Acceptance radius, in bins.
-        bins: Number V of bins.
-
-    Returns:
-        (…, V) summed probabilities.
-    """
     return below[..., pad + radius + 1 :][..., :bins] - below[..., pad - radius :][..., :bins]
 
 
@@ -195,11 +182,9 @@ class EarlyProposer(ChainProposer):
         return self.early.draft(self.target.pooled(chunk.target.prompt), radius)[0]
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return one chain: up to `depth` drafted tokens after the chunk's committed tokens."""
         return [self.drafted(chunk)[0][len(chunk.tokens) : chunk.size][:depth]]
 
     def is_sure(self, chunk: Chunk) -> bool:
-        """Return whether the estimated probability that the whole chunk is accepted is at least SURE."""
         return self.drafted(chunk)[1] >= SURE
 
 
@@ -220,35 +205,24 @@ class EarlyDrafter(TrainableDrafter):
     settings = EarlySettings
 
     def network(self, settings: Any, target: Any) -> nn.Module:
-        """Return a network with initial weights, for the target's action space, chunk length and pooled prompt."""
         return EarlyNetwork(settings, target.actions, target.chunk, target.pooled_width)
 
     @classmethod
     def proposer(cls, settings: NoSettings, context: Context) -> EarlyProposer:
-        """Build the proposer that drafts with the policy's early drafter."""
         return EarlyProposer(context.artifact(cls.kind), context.target)
 
     def decoded(
         self, target: Any, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace, columns: dict[str, Tensor]
     ) -> Decodes:
-        """Decode observations of an episode. Keep only pooled prompts, because whole prompts would fill the memory.
-
-        `TrainableDrafter.decoded` explains the arguments.
-        """
         prompts = list(prompts_of(target, observations_of(target, episode, steps, space)))
         features = torch.cat([target.pooled(prompt).half().cpu() for prompt in prompts])
         tokens = torch.cat([greedy(target, prompt)[0].cpu() for prompt in prompts])
         return EarlyExamples(features=features, tokens=tokens, **columns)
 
     def prepare(self, network: Any, examples: Any) -> None:
-        """Set the mean and the scale by which the network standardises its inputs, from the training examples."""
         network.standardise(examples.features)
 
     def loss(self, network: Any, target: Any, batch: Any, step: int, settings: Any) -> tuple[Tensor, Metrics]:
-        """Return the cross-entropy with soft labels, which spread each target token over neighbouring bins.
-
-        Tokens after the end of a chunk are not counted.
-        """
         labels = _labels(target.actions, settings.train.label_sigma, target.device)
         tokens, end = batch.tokens.to(target.device), target.actions.end
         logits = network(batch.features.to(target.device).float())
@@ -256,11 +230,7 @@ class EarlyDrafter(TrainableDrafter):
         return loss, {"token_loss": float(loss.detach())}
 
     def validate(self, network: Any, target: Any, held_out: Any, settings: Any) -> Metrics:
-        """Return metrics that compare drafts of held-out observations with the target's tokens.
-
-        All perturbed episodes (executed with noise) together weigh as much as all other episodes together. The score is
-        the mean number of accepted tokens with strict acceptance, plus the mean number with the acceptance radius 9.
-        """
+        """Score: tokens accepted strictly, plus those at r = 9. Perturbed episodes weigh as much as the others."""
         batches = held_out.features.split(256)
         logits = torch.cat([network(batch.to(target.device).float()).cpu() for batch in batches])
         strict = torch.from_numpy(target.actions.strict_tokens(logits.shape[1]))
@@ -281,7 +251,6 @@ def measure(logits: Tensor, examples: Decodes, strict: Tensor, end: int | None =
 
     Args:
         logits: (n, N, V) of the drafter.
-        examples: The target's greedy decodes of the same n observations.
         strict: (N,) bool, tokens that must equal the target's.
         end: The token that ends a chunk. Tokens after it are not counted. None if chunks have no such token.
 

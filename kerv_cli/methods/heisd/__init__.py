@@ -43,7 +43,6 @@ ROUNDING = 1e-5  # largest rounding error of a float32 dot product of two unit v
 
 @registry.ArtifactPart("datastore", by_task=True, needs_task=True, described_by=MANIFEST)
 def artifact() -> type:
-    """Import and return the class that finds, checks and loads datastores."""
     from kerv_cli.methods.heisd.datastore import DatastoreArtifact
 
     return DatastoreArtifact
@@ -76,10 +75,6 @@ class ExactIndex(Index):
     """datastore=exact, the default: compare the key with all entries of the task, in this process."""
 
     def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return the k most similar rows. Also return rows that may be among them if rounding errors are considered.
-
-        `Index.candidates` explains the arguments.
-        """
         import numpy as np
 
         shard = self.store.shards[task]
@@ -128,22 +123,16 @@ class RetrievalProposer(ChainProposer):
         if self._nearest is None or self._nearest[0] is not chunk:
             key = self.datastore.key_of(chunk.target.prompt, self.target)
             self._nearest = chunk, self.datastore.query(key, chunk.episode.task, self.count)
+            chunk.similarity = float(self._nearest[1].similarity[0])
         return self._nearest[1]
 
-    def similarity(self, chunk: Chunk) -> float | None:
-        """Return the cosine similarity of the most similar stored entry. None if no search was made for this chunk."""
-        searched = self._nearest is not None and self._nearest[0] is chunk
-        return float(self.neighbours(chunk).similarity[0]) if searched else None
-
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """Return the most similar stored chunks, as one tree of at most `depth` tokens per path."""
         from kerv_cli.methods.heisd.datastore import neighbour_tree
 
         chunks = self.neighbours(chunk).chunks[:, : chunk.size]
         return neighbour_tree(chunks, len(chunk.tokens), chunk.space, self.nodes, depth)
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return one chain per stored chunk: its tokens after the committed tokens. The most similar chunk is first."""
         start = len(chunk.tokens)
         return self.neighbours(chunk).chunks[:, start : min(chunk.size, start + depth)].tolist()
 
@@ -183,27 +172,19 @@ class HybridProposer(Proposer):
 
     @classmethod
     def build(cls, settings: HybridProposerSettings, context: Context) -> HybridProposer:
-        """Build the drafter's proposer and the retrieval proposer, and join them (`proposer=hybrid`)."""
         drafter = registry.ProposerPart.find("drafter").built(settings, context)
         return cls(drafter, RetrievalProposer(settings, context))
 
     def begin(self, chunk: Chunk) -> None:
-        """Select retrieval or the drafter for this chunk, as the boundary decided, and call the proposer's `begin`."""
         assert chunk.choice is not None, "a hybrid proposer needs a boundary"
         self.chosen = self.proposers[chunk.choice.mode]
         self.name = self.chosen.name
         self.chosen.begin(chunk)
 
-    def similarity(self, chunk: Chunk) -> float | None:
-        """Return the cosine similarity of the most similar stored entry. None if no search was made for this chunk."""
-        return self.proposers["retrieval"].similarity(chunk)
-
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """Return the draft of the selected proposer."""
         return self.chosen.propose(chunk, depth)
 
     def committed(self, chunk: Chunk, first: int, hidden: Tensor, target_tokens: Sequence[int]) -> None:
-        """Pass the results of a round to the selected proposer. `Proposer.committed` explains the arguments."""
         self.chosen.committed(chunk, first, hidden, target_tokens)
 
 
@@ -239,25 +220,12 @@ class GroupRule(DistanceRule):
 
     @classmethod
     def build(cls, settings: SequenceAcceptanceSettings, context: Context) -> GroupRule:
-        """Build the rule for the target's action space (`acceptance=sequence`)."""
         return cls(context.target.actions, settings.group_limit, settings.token_limit)
 
     def limits(self, r: int) -> tuple[int, ...]:
-        """Return the largest accepted distance of each of the D DoFs, in bins: `token_limit`, or 0 for strict DoFs.
-
-        The radius `r` is not used.
-        """
         return self.same_limits(self.token_limit)
 
     def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:
-        """Return the longest accepted path of whole groups.
-
-        Args:
-            tree: The draft tree.
-            target_tokens: The target's prediction after the last committed token, then after each node.
-            start: Number of committed tokens. A node at depth d is token start + d of the chunk.
-            r: Not used.
-        """
         limits, bounds = self.limits(r), self.space.bounds
         return accept_by_group(tree, target_tokens, start, limits, group_limit=self.group_limit, bounds=bounds)
 
@@ -286,11 +254,9 @@ class HybridRule(RelaxedRule):
 
     @classmethod
     def build(cls, settings: HybridAcceptanceSettings, context: Context) -> HybridRule:
-        """Build both rules for the target's action space (`acceptance=hybrid`)."""
         return cls(context.target.actions, settings.strict_dofs, retrieved=GroupRule.build(settings, context))
 
     def of_drafts_from(self, proposer: str) -> DistanceRule:
-        """Return the rule for the drafts of the proposer with this name."""
         return self.retrieved if proposer == "retrieval" else self
 
 
@@ -323,13 +289,11 @@ class Random(Boundary):
         self.reset("", 0)
 
     def reset(self, task: str, seed: int) -> None:
-        """Begin an episode: seed the random numbers."""
         import numpy as np
 
         self.random = np.random.default_rng([self.settings.seed, zlib.crc32(task.encode()), seed])
 
     def choose(self, path: np.ndarray) -> Choice:
-        """Choose retrieval with probability p, else the drafter. The hand's path is not used."""
         return Choice("retrieval" if self.random.random() < self.settings.p else "drafter")
 
 
@@ -337,7 +301,6 @@ class Always(Boundary):
     """Makes the same choice for every chunk: boundary=always_retrieval or boundary=always_drafter."""
 
     def choose(self, path: np.ndarray) -> Choice:
-        """Choose retrieval for `always_retrieval`, the drafter for `always_drafter`. The hand's path is not used."""
         return Choice(self.settings.kind.removeprefix("always_"))
 
 
@@ -384,7 +347,6 @@ class Fused(Boundary):
         self.f_star = self.ranges.limit(settings.quantile, settings.alpha) if limit is None else limit
 
     def choose(self, path: np.ndarray) -> Choice:
-        """Choose retrieval or the drafter by the newest `window` positions of the hand's path (m, 3), in metres."""
         points = path[-self.settings.window :]
         if len(points) < LEAST:
             return Choice("drafter")
@@ -408,7 +370,6 @@ class SimilaritySkipSettings:
     down: float = number(0.0, 0, 1e9)
 
     def needs(self) -> tuple[str, ...]:
-        """Return the kinds of artifacts needed: the datastore, and the calibration if `s_min` is None."""
         return ("datastore", "calibration") if self.s_min is None else ("datastore",)
 
 
@@ -428,14 +389,6 @@ class VerifySkip(Skip):
     def __init__(
         self, settings: SimilaritySkipSettings, retrieval: RetrievalProposer, levels: tuple[float, float, float]
     ) -> None:
-        """Start with the calibrated s_min.
-
-        Args:
-            settings: Settings of skip=similarity.
-            retrieval: Finds the most similar stored chunks.
-            levels: The task's (low, s_min, high), as cosines. s_min may change after each episode, between low and
-                high.
-        """
         self.settings, self.retrieval = settings, retrieval
         self.low, self.s_min, self.high = levels
         self.in_a_row = 0
@@ -443,10 +396,6 @@ class VerifySkip(Skip):
 
     @classmethod
     def build(cls, settings: SimilaritySkipSettings, context: Context) -> VerifySkip:
-        """Build the skip rule, with s_min from the settings or else from the calibration (`skip=similarity`).
-
-        If the method's proposer also retrieves, the skip rule uses that proposer's search instead of a second search.
-        """
         proposer: Proposer | None = context.built["proposer"]
         retrieval = proposer.proposers["retrieval"] if isinstance(proposer, HybridProposer) else proposer
         if not isinstance(retrieval, RetrievalProposer):
@@ -457,22 +406,15 @@ class VerifySkip(Skip):
         return cls(settings, retrieval, context.calibration.skip_levels(context.task, manifest.content))
 
     def begin(self, task: str, seed: int) -> None:
-        """Begin an episode: count skips from 0, and forget which stored episodes were executed to their end."""
         self.in_a_row = 0
         self.ended.clear()
 
     def finish(self, success: bool) -> None:
-        """End an episode. Raise s_min after a failure (setting `up`), and lower s_min after a success (`down`)."""
         span = self.high - self.low
         s_min = self.s_min + span * (-self.settings.down if success else self.settings.up)
         self.s_min = min(self.high, max(self.low, s_min))
 
-    def similarity(self, chunk: Chunk) -> float | None:
-        """Return the cosine similarity of the most similar stored entry. None if no search was made for this chunk."""
-        return self.retrieval.similarity(chunk)
-
     def take(self, chunk: Chunk) -> SkipDecision:
-        """Return the most similar stored chunk if it may be executed without verification, else no chunk."""
         if chunk.choice is not None and chunk.choice.mode != "retrieval":
             self.in_a_row = 0
             return SkipDecision()

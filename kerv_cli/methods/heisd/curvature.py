@@ -85,12 +85,8 @@ class BoundaryRanges:
 
         Args:
             paths: Measured hand positions of each episode, (T, 3) metres.
-            window: Number of positions in a window.
             known: An older calibration's ranges. They are kept, and only the attribute `points` is measured. If None,
                 everything is measured.
-
-        Raises:
-            CheckpointError: No path is curved, or the hand never moves.
         """
         measured = []
         for path in paths:
@@ -110,15 +106,7 @@ class BoundaryRanges:
         return replace(ranges, points=tuple((radius, length) for radius, length in points.tolist()))
 
     def limit(self, quantile: float, alpha: float) -> float:
-        """Return the limit F*: a quantile of F over the windows of the demonstrations.
-
-        Args:
-            quantile: Share of the windows whose F is smaller.
-            alpha: Weight of the radius. The length has the weight 1 − alpha.
-
-        Raises:
-            CheckpointError: The calibration holds no points, because an earlier version made it.
-        """
+        """Return the limit F*: a quantile of F over the windows of the demonstrations."""
         if not self.points:
             raise CheckpointError(
                 "the calibration has no quantiles of F for boundary.quantile: run 'kerv calibrate complete=true' for "
@@ -143,7 +131,6 @@ class BoundaryRanges:
         Args:
             radius: Radius of curvature, metres.
             length: Path length, metres.
-            alpha: Weight of the radius. The length has the weight 1 − alpha.
         """
         radius, length = self.normalise(radius, length)
         return alpha * radius + (1 - alpha) * length

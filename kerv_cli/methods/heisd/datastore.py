@@ -91,7 +91,6 @@ class Manifest:
 
     @property
     def content(self) -> str:
-        """Hash of the keys, the chunks and the target. It stays the same if an equal datastore is built again."""
         return content_of(self.key, self.chunk, self.target, self.files)
 
 
@@ -100,14 +99,9 @@ def prompt_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) 
 
     Args:
         prompt: (B, P, E) encoded prompts.
-        target: The target that encoded the prompts.
-        segments: Names of the S segments of the prompt to use, such as `scene`.
 
     Returns:
         (B, S · E) float32 keys, each with the norm 1.
-
-    Raises:
-        UnknownName: The target's prompt has no such segment.
     """
     parts = target.segments
     for name in segments:
@@ -129,15 +123,7 @@ def projected(keys: np.ndarray, projection: np.ndarray) -> np.ndarray:
 
 
 def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
-    """Refuse seeds that are not training seeds. Otherwise retrieval would know the evaluation's initial states.
-
-    Args:
-        seeds: Seeds of each task's episodes, by the task's full name.
-        where: The folder, for the error message.
-
-    Raises:
-        CheckpointError: A seed is not a training seed.
-    """
+    """Refuse seeds that are not training seeds. Otherwise retrieval would know the evaluation's initial states."""
     for task, numbers in seeds.items():
         training = spec_of(task).seeds.training
         shared = [seed for seed in numbers if seed not in training]
@@ -156,9 +142,7 @@ def best(vectors: np.ndarray, rows: np.ndarray, key: np.ndarray, k: int) -> tupl
 
     Args:
         vectors: (all rows, d) stored keys.
-        rows: Candidate rows, in ascending order.
         key: (d,) search key.
-        k: Number of rows wanted.
 
     Returns:
         The rows (k,) and their similarities (k,) float32, most similar first. Fewer if there are fewer candidates.
@@ -196,14 +180,12 @@ class Datastore:
 
     @functools.cached_property
     def index(self) -> Index:
-        """The search for similar keys that the setting `datastore=` chooses."""
         kind = self.search.kind if self.search else "exact"
         index: Index = SearchPart.find(kind, "datastore.kind").built(self, self.search)
         return index
 
     @functools.cached_property
     def longest(self) -> float:
-        """Largest Euclidean norm of a stored key. It bounds the rounding errors of the search."""
         return float(np.linalg.norm(self.vectors, axis=1).max(initial=0.0))
 
     @classmethod
@@ -211,14 +193,7 @@ class Datastore:
         """Open a datastore, and check that it was built for a target.
 
         Args:
-            folder: Folder of the datastore.
-            description: Description of the target.
             search: Settings of the search. If None, the search is exact.
-
-        Raises:
-            CheckpointError: The datastore is missing or damaged. Or it was built for another target, other action
-                statistics or another chunk length. Or it was built from evaluation seeds.
-            UsageError: The search is unknown or cannot be used.
         """
         manifest = DatastoreArtifact().checked(folder, description)
         rows, size = manifest.rows, manifest.actions.longest(manifest.chunk)
@@ -239,7 +214,6 @@ class Datastore:
 
     @property
     def tasks(self) -> Collection[str]:
-        """Full names of the tasks that have entries."""
         return self.shards
 
     def key_of(self, prompt: Tensor, target: ReadableTarget) -> np.ndarray:
@@ -247,7 +221,6 @@ class Datastore:
 
         Args:
             prompt: (1, P, E) encoded prompt.
-            target: The target that encoded the prompt.
         """
         (pooled,) = read(prompt_key(prompt, target, self.manifest.key)[0])
         key = pooled.astype(np.float32, copy=False)
@@ -258,12 +231,7 @@ class Datastore:
 
         Args:
             key: (d,) search key.
-            task: Full name of the task.
-            k: Number of entries.
             without: Seed of an episode to leave out, for leave-one-episode-out measurements. If None, use all episodes.
-
-        Raises:
-            UnknownName: The datastore has no entries of this task.
         """
         if task not in self.shards:
             raise UnknownName("task of the datastore", task, self.shards)
@@ -292,30 +260,17 @@ class DatastoreArtifact(Artifact[Manifest]):
     schema = Manifest
 
     def json(self, path: Path) -> Path:
-        """Return the path of `manifest.json`."""
         return path / MANIFEST
 
     def read(self, path: Path) -> Manifest:
-        """Read the manifest, and check that all its seeds are training seeds.
-
-        Raises:
-            CheckpointError: The manifest is missing or damaged, or a seed is not a training seed.
-        """
         manifest = super().read(path)
         check_seeds({task: shard.seeds for task, shard in manifest.tasks.items()}, path)
         return manifest
 
     def digest(self, path: Path, description: Manifest) -> str:
-        """Return the hash that identifies the datastore's content: its keys, its chunks and its target.
-
-        Args:
-            path: Folder of the datastore. Not used.
-            description: The datastore's manifest, which holds the hashes of all files.
-        """
         return description.content
 
     def load(self, path: Path, artifacts: Artifacts) -> Datastore:
-        """Open the datastore in `path`, with the search that the policy's settings choose."""
         return Datastore.open(path, artifacts.description, artifacts.search)
 
 
@@ -337,9 +292,6 @@ def neighbour_tree(
 
     Args:
         chunks: (k, N) tokens, most similar neighbour first.
-        start: Number of committed tokens. The tree begins after them.
-        space: The action space.
-        nodes: Maximum number of nodes of the tree.
         depth: Maximum number of tokens on a path. If None, paths end with the chunk.
         cross: Probability that a path changes to another neighbour after a group. If 0, paths never change, so only
             whole chunks are merged.
@@ -362,16 +314,7 @@ def neighbour_tree(
     order = count()
 
     def offer(parent: int, level: int, last: int, whole: int, cost: float) -> None:
-        """Offer the groups that may come next on a path, those of the most similar neighbours first.
-
-        Args:
-            parent: Last node of the path.
-            level: Number of groups on the path.
-            last: Bit set of the neighbours whose chunks have the last group of the path.
-            whole: Bit set of the neighbours whose chunks have all groups of the path. If no chunk has all of them, it
-                is a bit set of neighbours whose chunks have the path's groups since it last changed neighbours.
-            cost: −log probability of the path.
-        """
+        """Offer the groups that may come next on a path, those of the most similar neighbours first."""
         strict, givers = levels[level] if level < len(levels) else (False, [])
         pool = last if strict else everyone
         if strict:
@@ -405,5 +348,4 @@ def neighbour_tree(
 
 @functools.lru_cache(maxsize=4096)
 def _weight(members: int) -> float:
-    """Return the summed weight of the neighbours in a bit set. The i-th neighbour, counted from 1, has weight 1 / i."""
     return sum([1 / (1 + i) for i in range(members.bit_length()) if members >> i & 1])

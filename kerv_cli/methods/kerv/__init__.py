@@ -33,18 +33,11 @@ class PredictorPart(ProposerPart):
     chains: bool = True
 
     def built(self, settings: Any, context: Any) -> Any:
-        """Build the proposer that drafts with the predictor.
-
-        Args:
-            settings: Not used. The predictor is built with its default settings.
-            context: The context in which the method is built.
-        """
         from kerv_cli.methods.kerv.prediction import PredictionProposer
 
         return PredictionProposer(self.predictor(context))
 
     def predictor(self, context: Context) -> Predictor:
-        """Build the predictor with its default settings."""
         built: Predictor = super().built(self.default, context)
         return built
 
@@ -75,11 +68,7 @@ DRAFT = "draft"
 
 
 def find_predictor(name: str) -> PredictorPart:
-    """Return the predictor of this name, such as `kalman`.
-
-    Raises:
-        UnknownName: No predictor has this name.
-    """
+    """Return the predictor of this name, such as `kalman`."""
     predictors = PredictorPart.every()
     if name not in predictors:
         raise UnknownName("rectifier.predictor", name, [*predictors, DRAFT])
@@ -104,12 +93,6 @@ class CompensateSettings:
     rest: int = number(0, 0, MOST_DECODES)  # after a compensation, compensate nothing for this many decodes (KERV: 4)
 
     def check_together(self, prefix: str) -> None:
-        """Refuse an unknown predictor, and `predictor=draft` with `use_target_token=false`.
-
-        Raises:
-            UnknownName: The predictor does not exist.
-            UsageError: `predictor=draft` is combined with `use_target_token=false`.
-        """
         if self.predictor != DRAFT:
             find_predictor(self.predictor)
         elif not self.use_target_token:
@@ -118,7 +101,6 @@ class CompensateSettings:
             )
 
     def needs(self) -> tuple[str, ...]:
-        """Return the kinds of artifacts that the predictor needs."""
         return () if self.predictor == DRAFT else find_predictor(self.predictor).needed(self)
 
 
@@ -144,24 +126,17 @@ class Compensation(Rectifier):
 
     @classmethod
     def build(cls, settings: CompensateSettings, context: Context) -> Compensation:
-        """Build the rectifier with the predictor that the settings name (`rectifier=compensate`)."""
         name = "hold" if settings.predictor == DRAFT else settings.predictor
         predictor = find_predictor(name).predictor(context)
         return cls(settings, predictor if settings.hold_strict else predictor.released())
 
     def reset(self) -> None:
-        """Begin an episode: compensation is allowed at once."""
         self.resting = 0
 
     def next_decode(self) -> None:
-        """Count a finished decode. After a compensation, nothing is compensated for `settings.rest` decodes."""
         self.resting = max(0, self.resting - 1)
 
     def rectify(self, chunk: Chunk) -> Rectified | None:
-        """Predict the missing values of the rejected control step, and of further steps if `steps` is above 1.
-
-        Return None if nothing can be predicted, or if a recent decode was compensated (setting `rest`).
-        """
         from kerv_cli.methods.kerv.prediction import assemble
 
         if self.resting:
@@ -186,11 +161,6 @@ class RadiusRange:
     r_max: int
 
     def check_together(self, prefix: str) -> None:
-        """Refuse an `r_min` above `r_max`.
-
-        Raises:
-            UsageError: `r_min` is above `r_max`.
-        """
         if self.r_min > self.r_max:
             raise UsageError(
                 f"threshold.r_min={self.r_min} threshold.r_max={self.r_max}: r_min must not be above r_max"
@@ -228,7 +198,6 @@ class KinematicThresholdSettings(RadiusRange):
         return f"{'sum' if self.total else 'mean'} of {self.over}"
 
     def needs(self) -> tuple[str, ...]:
-        """Return the kinds of artifacts needed: the calibration, if `k_s` is None."""
         return ("calibration",) if self.k_s is None else ()
 
 
@@ -265,11 +234,6 @@ class Variable(Threshold):
     """
 
     def __init__(self, settings: KinematicThresholdSettings, context: Context) -> None:
-        """Read the settings. If they contain no K_S, read the task's K_S from the calibration.
-
-        Raises:
-            CheckpointError: The calibration has no K_S for the task.
-        """
         self.settings, self.measure = settings, settings.measure
         if settings.k_s is not None:
             self.k_s = settings.k_s
@@ -280,25 +244,17 @@ class Variable(Threshold):
         self.reset()
 
     def reset(self) -> None:
-        """Begin an episode with r = f(K_S), or for `quoted` with r = r_min. K_S counts as the last K."""
         self.last = self.k_s
         self.r = float(self.settings.r_min) if self.settings.kind == "quoted" else self.falling(self.k_s)
 
     def falling(self, x: float) -> float:
-        """Return f(x), a radius that falls as x, a variability or its change, grows."""
         s = self.settings
         return falling(s.r_min, s.r_max, x / self.k_s, s.phi)
 
     def radius(self) -> int:
-        """Return the acceptance radius r, rounded to whole bins."""
         return nearest(self.r)
 
     def update(self, variability: float | None) -> None:
-        """Set r for the next decode.
-
-        Args:
-            variability: K of the last decode. If None, no draft was compared, and r stays.
-        """
         if variability is None:
             return
         s, change = self.settings, variability - self.last
@@ -324,20 +280,16 @@ class Schedule(Threshold):
     """
 
     def __init__(self, settings: ScheduleThresholdSettings, context: Context) -> None:
-        """Read the settings."""
         self.settings, self.decodes = settings, 0
 
     def reset(self) -> None:
-        """Begin an episode: set the number t of decodes to 0."""
         self.decodes = 0
 
     def radius(self) -> int:
-        """Return the acceptance radius r(t), rounded to whole bins."""
         s = self.settings
         return nearest(falling(s.r_min, s.r_max, self.decodes / s.tau, s.phi))
 
     def update(self, variability: float | None) -> None:
-        """Count a decode. Its variability is not used."""
         self.decodes += 1
 
 

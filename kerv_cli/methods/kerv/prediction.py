@@ -51,10 +51,6 @@ def filter_state(ratio: float, window: int) -> tuple[np.ndarray, np.ndarray]:
     The state is [action, velocity]. The filter begins at the first action a₀ with the state [a₀, 0] and the covariance
     r · I. For each further action the filter predicts and updates once.
 
-    Args:
-        ratio: q / r, process noise divided by measurement noise.
-        window: Number of actions.
-
     Returns:
         Two matrices. The weights (2, window) times the actions (oldest first) give the state after the last action. The
         transition matrix (2, 2) advances a state by one control step.
@@ -80,12 +76,6 @@ def kalman_weights(q: float, r: float, window: int, horizon: int) -> np.ndarray:
     """Return the weights (horizon, window) of the past actions in a Kalman filter's predictions for one DoF.
 
     The prediction h control steps ahead is the dot product of row h − 1 and the last `window` actions (oldest first).
-
-    Args:
-        q: Process noise.
-        r: Measurement noise.
-        window: Number of past actions.
-        horizon: Number of control steps ahead.
     """
     state, transition = filter_state(q / r, window)
     return np.stack([(np.linalg.matrix_power(transition, h) @ state)[0] for h in range(1, horizon + 1)])
@@ -110,17 +100,6 @@ class Predictor:
         window: int = WINDOW,
         horizon: int = HORIZON,
     ) -> None:
-        """Compute the weights of the past actions in the predictions.
-
-        They are computed once for each possible number of past actions, from `minimum` to `window`.
-
-        Args:
-            held: (D,) bool, whether the DoF keeps its last value.
-            noise: Fitted noise of a Kalman filter. None if the predictor needs no fitted noise.
-            minimum: Minimum number of past actions for a prediction. If None, it is `least`.
-            window: Maximum number of past actions that are used.
-            horizon: Maximum number of control steps ahead.
-        """
         self.held, self.dofs, self.noise = np.asarray(held, dtype=bool), len(held), noise
         self.minimum, self.window, self.horizon = self.least if minimum is None else minimum, window, horizon
         self.tables = {}  # for each number of past actions the weights (D, horizon, past actions) of all DoFs
@@ -131,25 +110,17 @@ class Predictor:
             self.tables[past] = table
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return the weights (horizon, window) of the past actions in the predictions for one DoF.
+        """Return the weights (horizon, window) of the past actions, oldest first, in the predictions for one DoF.
 
-        The prediction h control steps ahead is the dot product of row h − 1 and the past actions (oldest first). In
-        this base class, only the newest action has a weight other than 0.
-
-        Args:
-            dof: Index of the DoF.
-            window: Number of past actions.
+        The prediction h control steps ahead is the dot product of row h − 1 and the past actions.
         """
         weights = np.zeros((self.horizon, window))
         weights[:, -1] = 1.0
         return weights
 
     def released(self) -> Self:
-        """Return a copy of this predictor that also predicts the strict DoFs, instead of holding them.
-
-        Raises:
-            CheckpointError: The predictor is a Kalman filter, and the calibration has no noise for a strict DoF.
-        """
+        """Return a copy that also predicts the strict DoFs, instead of holding them."""
+        """Return a copy of this predictor that also predicts the strict DoFs, instead of holding them."""
         if self.noise is not None and not all(self.noise.q):
             raise CheckpointError(
                 "the calibration's filters were not fitted to strict DoFs: run 'kerv calibrate complete=true'"
@@ -161,7 +132,6 @@ class Predictor:
 
         Args:
             history: (m, D) past actions, oldest first.
-            steps: Number of actions to predict.
 
         Returns:
             (steps, D) in [-1, 1]. None if the history has fewer than `minimum` actions.
@@ -187,10 +157,6 @@ class Linear(Predictor):
     least = 2
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return the weights (horizon, window) of the past actions in the predictions.
-
-        For h steps ahead, the newest action has the weight 1 + h, and the action before it has the weight −h.
-        """
         ahead = np.arange(1, self.horizon + 1)
         weights = np.zeros((self.horizon, window))
         weights[:, -1], weights[:, -2] = 1 + ahead, -ahead
@@ -204,7 +170,6 @@ class Kalman(Predictor):
     least = MINIMUM
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return the weights (horizon, window) of the last `window` actions in the filter's predictions for one DoF."""
         assert self.noise is not None
         return kalman_weights(self.noise.q[dof], self.noise.r[dof], window, self.horizon)
 
@@ -222,10 +187,6 @@ class Walk(Predictor):
     noise_ratio = 1.0 / 1e-3  # Q / R
 
     def weights(self, dof: int, window: int) -> np.ndarray:
-        """Return the weights (horizon, window) of the past actions in the predictions.
-
-        All rows are equal. The filter has no velocity, so it predicts its estimate of the last action for every step.
-        """
         state, variance = np.eye(1, window)[0], 1.0  # all variances divided by R
         for newest in np.eye(window)[1:]:
             variance += self.noise_ratio
@@ -247,7 +208,6 @@ class PredictionProposer(ChainProposer):
         self.name, self.predictor = predictor.name, predictor
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return one chain of up to `depth` predicted tokens, or no chain if the history is too short."""
         whole = len(chunk.tokens) // chunk.dofs
         pending = np.array(chunk.tokens[: whole * chunk.dofs], dtype=np.int64).reshape(whole, chunk.dofs)
         history = chunk.episode.history(chunk.space.values_of(pending))
@@ -266,13 +226,6 @@ def assemble(
     `settings.steps` control steps are filled, beginning with the first step that is not completely known. One step
     fewer is filled if fewer than `min_verified` DoFs of that first step are known. One step fewer is also filled if
     none of them is known and the setting `drop` is true. Neither rule applies to the first control step of the chunk.
-
-    Args:
-        tokens: Known tokens of the chunk: accepted draft tokens and tokens of the target.
-        chunk: The chunk.
-        predictor: Predicts the actions that are still missing.
-        settings: Settings of the compensation.
-        drafted: Tokens of the rejected draft that follow `tokens`. If empty, only predictions fill the gap.
 
     Returns:
         (S, D) normalised actions of the chunk's first S control steps, known and filled ones. None if there are too few
