@@ -198,7 +198,7 @@ def reference_level(records: Sequence[DecodeRecord], actions: ActionSpace, chunk
         found = np.array([variability(record.rounds, actions, measure) for record in records], dtype=float)
         known = found[~np.isnan(found)]  # NaN: no draft token counts
         median = float(np.median(known)) if len(known) else 0.0
-        levels[measure] = max(median, bin_width if measure.total else bin_width / moving)
+        levels[measure] = max(median, bin_width if measure.startswith("sum") else bin_width / moving)
     return stored.Variability(levels[MEAN], len(records), levels)
 
 
