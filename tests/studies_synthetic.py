@@ -85,7 +85,7 @@ def study_of(
     made = tuple(
         Setting(
             label,
-            f"method={label.replace(' ', ' threshold.')}",
+            tuple(f"method={label.replace(' ', ' threshold.')}".split()),
             without(asdict(one), {"task"}),
             IDENTITY,
             name=" ".join(word for word in label.split() if "=" not in word),

@@ -19,13 +19,14 @@ from conftest import served
 from PIL import Image
 from playwright.sync_api import expect
 from starlette.testclient import TestClient
-from studies_synthetic import episode, part, settings_of, study_of, swept, threshold_study
+from studies_synthetic import episode, settings_of, study_of, swept, threshold_study
 
 from kerv_cli.board.app import make_app
 from kerv_cli.board.episode import RECORDER, command_of, record_episode
 from kerv_cli.board.episodes import phase_of
 from kerv_cli.catalogue.episodes import find_episode
 from kerv_cli.engine.record import Delay
+from kerv_cli.episodes.resolve import resolve_rollout
 from kerv_cli.episodes.rows import decode_records, decodes_table
 from kerv_cli.episodes.runner import Runner, close_worlds
 from kerv_cli.lab.database import WANTED, Database, opened
@@ -172,14 +173,17 @@ def test_the_command_on_the_page_repeats_the_episode(rolled):
 
 
 def test_settings_that_adapt_are_repeated_with_the_episodes_before(tmp_path):
-    adapting = settings_of("spec_vla", 9)
-    adapting.skip = part("skip", "similarity", up=0.01)
+    typed = ("method=spec_vla", "skip=similarity", "skip.up=0.01", "episodes=4")
+    adapting = resolve_rollout([*typed, "task=reach-v3"], multirun=False).first
     store, _ = swept(tmp_path, study_of({"ar": settings_of("ar"), "spec_vla": adapting}, ["reach-v3"]))
     numbers = store.frame().set_index(["label", "seed"])["episode"].to_dict()
     last, plain = (find_episode(store.database, numbers[label, 100_003]) for label in ("spec_vla", "ar"))
     assert (last.earlier, plain.earlier) == ((100_000, 100_001, 100_002), ())
-    words, _ = command_of(last)
-    assert "seed=100000 episodes=4 record=-1" in words
+    episode = replace(last.episode, setting=replace(last.episode.setting, overrides=typed))
+    words, _ = command_of(replace(last, episode=episode))
+    assert words.startswith(" ".join(["kerv rollout", *typed[:3], "task=reach-v3 seed=100000 episodes=4"]))
+    assert "record=-1" in words
+    assert "presets in conf/ have changed" in command_of(last)[1]  # method=spec_vla alone gives other settings
 
 
 def test_an_episode_whose_policy_has_changed_is_not_recorded(tmp_path):

@@ -29,7 +29,7 @@ on_sqlite = pytest.mark.parametrize("database", ["sqlite"], indirect=True)
 
 
 def work(settings: RolloutSettings, weights: dict[str, str] = IDENTITY) -> str:
-    return Setting("x", "", without(asdict(settings), {"task"}), weights).work
+    return Setting("x", (), without(asdict(settings), {"task"}), weights).work
 
 
 def changed(path: str, value: Any) -> RolloutSettings:
@@ -221,7 +221,7 @@ def test_reasons_name_what_changed(database, monkeypatch):
     swept(database.results, threshold_study(["reach-v3"]))
 
     def reason(settings, task="reach-v3", weights=IDENTITY):
-        setting = Setting("spec_vla r=3", "", without(asdict(settings), {"task"}), weights)
+        setting = Setting("spec_vla r=3", (), without(asdict(settings), {"task"}), weights)
         split = Study(database, "threshold", "sweep", (setting,), all_episodes([setting], [task])).plan()
         return next(iter(split.missing.values()), "")
 

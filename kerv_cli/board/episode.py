@@ -174,12 +174,12 @@ def command_of(found: FoundEpisode) -> tuple[str, str]:
     Returns:
         (command, reason). One of them is empty.
     """
-    from kerv_cli.episodes.repeat import repeating_words  # imports torch, which takes seconds
+    from kerv_cli.episodes.resolve import repeating_words
 
     episode, results = found.episode, str(found.store.database.results)
     setting, seeds = episode.setting, [*found.earlier, episode.seed]
     try:
-        words = repeating_words(setting.settings, setting.identity, setting.overrides, episode.task, seeds)
+        words = repeating_words(setting, episode.task, seeds)
     except KervError as error:
         return "", str(error)
     return shlex.join(["kerv", *words, *([] if results == "results" else [f"results={results}"])]), ""

@@ -45,7 +45,7 @@ class Setting:
 
     Attributes:
         label: The setting's name in the study.
-        overrides: The overrides from which the setting is composed, as the user wrote them.
+        overrides: All overrides, `key=value`, from which the setting is composed.
         settings: The rollout's settings as nested plain values, without the task.
         identity: Hashes of the weights and data that the setting reads.
         varies: This setting's values for the keys that differ within its grid, by key. An entry of the study expands
@@ -54,7 +54,7 @@ class Setting:
     """
 
     label: str
-    overrides: str
+    overrides: tuple[str, ...]
     settings: Plain
     identity: Identity
     varies: Mapping[str, Any] = field(default_factory=dict)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from kerv_cli.base.files import read_yaml_lines
 from kerv_cli.base.limits import check_label
 from kerv_cli.base.paths import find_target
 from kerv_cli.base.registry import METHOD_KINDS, PART_GROUPS, AcceptancePart, ArtifactPart
-from kerv_cli.episodes.identity import NOT_DETERMINING_RUNTIME, flat
+from kerv_cli.episodes.identity import NOT_DETERMINING, NOT_DETERMINING_RUNTIME, Setting, flat, work_of
 from kerv_cli.episodes.settings import (
     CONSTANT,
     DEFAULT_TASKS,
@@ -41,12 +41,14 @@ class Point:
     Attributes:
         name: Name of the grid. All points of a grid have the same name.
         overrides: This point's overrides, `key=value`.
+        words: All overrides from which the setting is composed, those of the study and the command line included.
         varies: This point's values for the keys that differ within the grid, by key.
     """
 
     name: str
     overrides: tuple[str, ...]
     varies: Mapping[str, str] = field(default_factory=dict)
+    words: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, name: str, overrides: Sequence[str], varied: Collection[str]) -> Point:
@@ -62,7 +64,7 @@ class Point:
             key, value = override.lstrip("+").split("=", 1)
             if key in varied:
                 varies[key] = value
-        return cls(name, tuple(overrides), varies)
+        return cls(name, tuple(overrides), varies, tuple(overrides))
 
     @property
     def label(self) -> str:
@@ -143,7 +145,9 @@ def resolve(
     settings: dict[str, RolloutSettings] = {}
     for label, point in points.items():
         with _line_of(path, typed, f"settings.{point.name}", dict.fromkeys(map(_key, common), "common")):
-            settings[label] = compose("rollout", _outranked(common, point.overrides), RolloutSettings)
+            words = _outranked(common, point.overrides)
+            settings[label] = compose("rollout", words, RolloutSettings)
+            points[label] = replace(point, words=tuple(words))
     if study.axis and not any(study.axis in flat(asdict(setting)) for setting in settings.values()):
         varies = chain.from_iterable(point.varies for point in points.values())
         with _line_of(path, (), "axis"):
@@ -234,6 +238,31 @@ def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
     _settle(settings.values(), settings[baseline])
     study = StudySettings(name="rollout", title="", baseline=baseline, block=MOST_SEEDS)
     return ResolvedStudy(SweepSettings(study=study), settings, points)
+
+
+def repeating_words(setting: Setting, task: str, seeds: Sequence[int]) -> list[str]:
+    """Return the arguments of `kerv` that run stored episodes of one task again, and record them.
+
+    Args:
+        setting: The stored setting.
+        task: Name of the task.
+        seeds: Seeds of the episodes, which must be successive.
+
+    Raises:
+        UsageError: No command repeats the episodes, because the presets in conf/ have changed or the seeds have gaps.
+    """
+    if list(seeds) != list(range(seeds[0], seeds[0] + len(seeds))):
+        raise UsageError("its skip rule adapts from episode to episode, and the seeds before it have gaps")
+    place = [f"task={task}", f"seed={seeds[0]}", f"episodes={len(seeds)}", *(["record=-1"] if len(seeds) > 1 else [])]
+    unused = (NOT_DETERMINING - {"policy", "method"}) | {f"runtime.{name}" for name in NOT_DETERMINING_RUNTIME}
+    words = [word for word in setting.overrides if not any(f"{_key(word)}.".startswith(f"{key}.") for key in unused)]
+    composed = asdict(resolve_rollout([*words, *place], multirun=False).first)
+    if composed["runtime"]["device"] == "auto":
+        composed["runtime"]["device"] = setting.settings["runtime"]["device"]
+        words.append(f"runtime.device={composed['runtime']['device']}")
+    if work_of(composed, setting.identity) != setting.work:
+        raise UsageError("the presets in conf/ have changed since: no command gives these settings any more")
+    return ["rollout", *words, *place]
 
 
 def _settle(settings: Iterable[RolloutSettings], baseline: RolloutSettings, narrows: bool = False) -> None:

@@ -139,9 +139,10 @@ SETTINGS = _table(
     _to("study_id", "studies.id", nullable=False, index=True),
     sa.Column("work", _TEXT, nullable=False, index=True),  # hash of what determines a result
     *_required(_INTEGER, "position"),
-    *_required(_TEXT, "label", "name", "method", "overrides"),  # name: shared by the settings of a grid
+    *_required(_TEXT, "label", "name", "method"),  # name: shared by the settings of a grid
     # varies: key -> value in a grid; identity: hashes of weights and data
     *_required(_OBJECT, "varies", "settings", "identity"),
+    *_required(_LIST, "overrides"),  # from which the setting is composed
     sa.UniqueConstraint("study_id", "label"),
 )
 BLOCKS = _table(

@@ -501,7 +501,7 @@ def _save_setting(connection: sa.Connection, study: int, position: int, setting:
         "name": setting.name,
         "method": str(setting.settings["method"]),
         "varies": dict(setting.varies),
-        "overrides": setting.overrides,
+        "overrides": list(setting.overrides),
         "settings": dict(setting.settings),
         "identity": dict(setting.identity),
     }
@@ -523,7 +523,9 @@ def setting_of(row: Any) -> Setting:
     texts = [row.settings.get("method"), *row.identity.values()]
     if not all(isinstance(text, str) for text in texts):
         raise Damaged(f"the method or the identity of setting {row.label}")
-    return Setting(check_label(row.label), row.overrides, row.settings, row.identity, row.varies, row.name)
+    return Setting(
+        check_label(row.label), tuple(map(str, row.overrides)), row.settings, row.identity, row.varies, row.name
+    )
 
 
 def stored_settings(connection: sa.Connection, study: int) -> tuple[dict[int, Setting], tuple[Episode, ...]]:

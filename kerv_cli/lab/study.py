@@ -77,7 +77,7 @@ def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], ki
             one.runtime.device = "cuda" if one.runtime.executor_options.gpus else "cpu"
         plain = asdict(one)
         del plain["task"]
-        settings.append(Setting(label, " ".join(point.overrides), plain, identity, point.varies, point.name))
+        settings.append(Setting(label, point.words, plain, identity, point.varies, point.name))
     settings.sort(key=lambda setting: setting.label != about.baseline)
     episodes = all_episodes(settings, resolved.tasks, about.block)
     own = {name: getattr(about, name) for name in ABOUT}

@@ -194,7 +194,7 @@ def further_of(data: StudyData) -> dict[str, Any]:
         about = {
             "name": setting.name,
             "varies": dict(setting.varies),
-            "overrides": setting.overrides,
+            "overrides": " ".join(setting.overrides),
             "settings": without(setting.settings, {"results", "task"}),
             "identity": dict(setting.identity),
             "provenance": {name: runtime[name] for name in RUNTIME} | dict(row.provenance),
@@ -280,7 +280,7 @@ def _settings(data: StudyData) -> list[dict[str, Any]]:
     settings = []
     for label, own in flat.items():
         reference = data.references[label]
-        about = {"label": label, "overrides": data.settings[label].overrides, "reference": reference}
+        about = {"label": label, "overrides": " ".join(data.settings[label].overrides), "reference": reference}
         settings.append({**about, "differs": differences(flat.get(reference, {}), own)})
     return settings
 

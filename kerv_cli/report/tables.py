@@ -331,7 +331,7 @@ def _results(data: StudyData, averaging: str) -> list[Result]:
             measures=pooled[(task, label) if task else label],
             by_difficulty=by_difficulty.get(label),
             runs=len(data.pairs_of_runs),
-            overrides=setting.overrides,
+            overrides=" ".join(setting.overrides),
             settings=flatten(without(setting.settings, NOT_DETERMINING - {"policy"})),
             observation=setting.identity.get(OBSERVATION, ""),
             hashes=hashes,
