@@ -16,7 +16,7 @@ from flips import flipped
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.bench import measure as measuring
-from kerv_cli.bench.measure import Laps, Phase, card_of, costs_of, decoders, measure, measure_machine, profile_of
+from kerv_cli.bench.measure import Laps, Phase, costs_of, decoders, measure, profile_of
 from kerv_cli.bench.model import open_model
 from kerv_cli.bench.physics import Sizes
 from kerv_cli.bench.settings import BenchSettings
@@ -128,12 +128,10 @@ def test_the_sizes_of_an_openvla_policy_are_counted_and_its_decodes_measured(tmp
     kerv("build", "target", "target=openvla", f"checkpoint={tmp_path}/tiny", f"results={tmp_path}")
     settings = BenchSettings(target="openvla", repeats=3, results=str(tmp_path))
     model = open_model(settings)
-    machine = measure_machine(model.target.device, model.dtype)
     width, layers = TINY.language.hidden_size, TINY.language.num_hidden_layers
     weights = layers * (4 * width**2 + 3 * width * TINY.language.intermediate_size) + width * 256
-    card = card_of(model, machine)
-    assert (card["weights"], card["weight_bytes"]) == (weights, 4 * weights)
-    _, phases = measure(model, machine, settings)
+    assert (model.sizes.trunk_weights, model.sizes.weight) == (weights, 4)
+    phases = measure(model, settings)
     assert {phase.kind for phase in phases} == {"encode", "prefill", "verify", "feed", "draft", "tree"}
 
 
@@ -230,7 +228,7 @@ def test_the_command_ends_with_one_document(tmp_path):
     document = json.loads(told.splitlines()[-1])
     path = tmp_path / "bench/nano-float32.json"
     assert document == json.loads(path.read_text())
-    assert {"card", "phases", "profile", "git_commit"} <= set(document)
+    assert {"phases", "profile", "git_commit"} <= set(document)
     assert next(p["name"] for p in document["phases"] if p["kind"] == "verify") == "one token"
     (single,) = [p["seconds"] for p in document["phases"] if p["name"] == "one token"]
     assert read_profile(path).seconds("verify", 1) == single

@@ -143,6 +143,7 @@ def test_no_acceptance_is_taken_from_other_chunks_and_no_ceiling_beats_one_forwa
         assert low[method]["speeds"]["0"] < 1.01
     sentence = machine("weights=7B", "tokens=7", "accepted=0.6")["sentence"]
     assert "at acceptance 0.6" in sentence
+    assert "method=last_action is the draft to try first" in sentence
     assert all(one["method"] in {draft.method for draft in DRAFTS} for one in shown.values())
 
 

@@ -22,10 +22,9 @@ FLOW = (
     "speculation does not apply: a flow policy has no action tokens to draft. What applies: longer chunks (fewer "
     "decodes per second), and rollout.clock=real, which shows what its latency costs in success"
 )
+# Weights of layers and head, layers, vocabulary: SmolLM2-135M, TinyLlama, Llama-2 7B and 70B
 PUBLISHED = ((0.135e9, 30, 49_152), (1.03e9, 22, 32_000), (6.61e9, 32, 32_000), (68.7e9, 80, 32_000))
-"""Weights of layers and head, layers, vocabulary: SmolLM2-135M, TinyLlama, Llama-2 7B and 70B."""
-LOOP = 256
-"""Tokens that common loops decode for a FAST chunk, whatever its length (openpi)."""
+LOOP = 256  # tokens that common loops decode for a FAST chunk, whatever its length (openpi)
 _PATCHES = TOWERS["vit_so400m_patch14_siglip_224"].patches
 _SHARE = 0.1  # of the weights are the vision encoder's, as in OpenVLA-7B
 _SMALL = 50e6  # a policy with fewer weights is assumed to be like kerv's own: 8 layers, 256 ids
@@ -65,7 +64,7 @@ class Draft:
         return first + forward("prefill", profile.prompt + whole, whole, 0)
 
 
-DRAFTS = (Draft("one_pass_strict", source="early"), Draft("naive_sd", chain=5))
+DRAFTS = (Draft("last_action"), Draft("one_pass_strict", source="early"), Draft("naive_sd", chain=5))
 
 
 def shape_of(weights: str) -> tuple[Shape, str]:
@@ -81,7 +80,6 @@ def shape_of(weights: str) -> tuple[Shape, str]:
 
 
 def number_of(text: str) -> float:
-    """Return the number that `7B`, `450M` or `3.5e9` states."""
     units = {"K": 1e3, "M": 1e6, "B": 1e9, "G": 1e9}
     try:
         number = float(text[:-1]) * units[text[-1].upper()] if text[-1:].upper() in units else float(text)
@@ -168,8 +166,6 @@ def break_even(draft: Draft, profile: Profile, tokens: int) -> float | None:
 def sentence(engines: Sequence[dict[str, Any]], tokens: int, settings: EstimateSettings) -> str:
     """Say how much verified drafts can give at most, and what pays first. The first engine counts."""
     best, worst = engines[0], engines[-1]
-    if not best["drafts"]:
-        return "The profile has no cost of a draft: measure one with kerv bench."
     chance = f"{sorted(settings.accepted)[len(settings.accepted) // 2]:g}"
     gains = {}
     for one in best["drafts"]:
@@ -182,7 +178,8 @@ def sentence(engines: Sequence[dict[str, Any]], tokens: int, settings: EstimateS
     ceiling = max(one["ceiling"] for one in best["drafts"])
     return (
         f"At {tokens} tokens and {best['ms']:.3g} ms per chunk verified drafts give at most {ceiling:.2f}; the encoder "
-        f"takes {share:.0%}; what pays first is {', then '.join(first[:2]) or 'a smaller or faster target'}."
+        f"takes {share:.0%}; what pays first is {', then '.join(first[:2]) or 'a smaller or faster target'}. "
+        "method=last_action is the draft to try first: nothing is trained, and the tokens stay the same."
     )
 
 
@@ -191,7 +188,7 @@ def rate(engines: Sequence[dict[str, Any]], hz: float, actions: int) -> str:
     limit, words = 1e3 * actions / hz, []
     for one in engines:
         needed = one["ms"] / limit
-        ceiling = max((draft["ceiling"] for draft in one["drafts"]), default=1.0)
+        ceiling = max(draft["ceiling"] for draft in one["drafts"])
         who = "fast enough" if needed <= 1 else f"{needed:.2f} times too slow"
         who += ", more than verified drafts give" if needed > ceiling else ""
         words.append(f"{one['engine']}: AR takes {one['ms']:.3g} ms, {who}")
@@ -208,7 +205,6 @@ def _fast(profile: Profile, tokens: int) -> str:
 
 
 def part_rows(engines: Sequence[dict[str, Any]]) -> Iterator[dict[str, str]]:
-    """Yield a row per part of an AR decode. Each cell has the figures of all engines."""
     for parts in zip(*(one["parts"] for one in engines), strict=True):
         shares = [f"{part['ms'] / one['ms']:.0%}" for part, one in zip(parts, engines, strict=True)]
         cells = {"ms": _beside([f"{part['ms']:.3g}" for part in parts]), "share": _beside(shares)}
@@ -218,7 +214,6 @@ def part_rows(engines: Sequence[dict[str, Any]]) -> Iterator[dict[str, str]]:
 
 
 def draft_rows(engines: Sequence[dict[str, Any]]) -> Iterator[dict[str, str]]:
-    """Yield a row per lossless method. Each cell has the figures of all engines."""
     for drafts in zip(*(one["drafts"] for one in engines), strict=True):
         cells = {}
         for chance in drafts[0]["speeds"]:

@@ -1,13 +1,10 @@
 """Measure how long each phase of a decode takes, and what the device can do at best.
 
-The engine runs complete decodes with dummy drafts.
-
-`measure` is the whole benchmark. The functions before it run the decodes and split their seconds into phases.
+The engine runs complete decodes with dummy drafts. `measure` is the whole benchmark.
 """
 
 from __future__ import annotations
 
-import copy
 import functools
 import itertools
 import logging
@@ -19,7 +16,6 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch.utils.flop_counter import FlopCounterMode
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError
@@ -38,9 +34,8 @@ from kerv_cli.episodes.cost import FORWARDS, Profile
 from kerv_cli.episodes.policy import decoder_for
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer
-from kerv_cli.methods.early.drafter import EarlyProposer
 from kerv_cli.methods.spec_vla import RelaxedRule
-from kerv_cli.targets.compact.program import Program, stored_bytes
+from kerv_cli.targets.compact.program import Program
 from kerv_cli.targets.provenance import stamp
 
 _LOG = logging.getLogger("kerv")
@@ -54,10 +49,8 @@ _EVICTING = 16 * 2**20  # float32 numbers that are read before each decode, to e
 _TREE = (5, 8, 50)  # depth, children, nodes of EAGLE-2's tree
 _MERGED = 30  # nodes of a merged in-prefill draft
 _TASK = "reach-v3"
-Key = tuple[str, int]
-"""The attributes `kind` and `rows` of a `Phase`."""
-Lap = tuple[str, float]
-"""Phase of a decode, as in `engine.record.PHASES`, and its seconds."""
+Key = tuple[str, int]  # the attributes `kind` and `rows` of a `Phase`
+Lap = tuple[str, float]  # phase of a decode, as in `engine.record.PHASES`, and its seconds
 
 
 @dataclass(frozen=True)
@@ -86,17 +79,14 @@ class Machine:
         return self.bandwidth
 
     def bounds(self, read: float, flops: float) -> tuple[float, float]:
-        """Return the shortest possible seconds for reading `read` bytes, and for `flops` operations."""
         return read / self.bandwidth_of(read), flops / self.flops
 
     def best_of(self, other: Machine) -> Machine:
-        """Return the higher value of two measurements in each field. Other programs can only make a value lower."""
         caches = tuple(map(max, self.caches, other.caches))
         return Machine(max(self.bandwidth, other.bandwidth), max(self.flops, other.flops), caches)
 
 
 def fastest(work: Callable[[], object], device: torch.device) -> float:
-    """Run a function a few times, and return the seconds of the fastest run."""
     seconds = math.inf
     for _ in range(REPEATS):
         clock = Stopwatch(device)
@@ -107,12 +97,7 @@ def fastest(work: Callable[[], object], device: torch.device) -> float:
 
 @torch.inference_mode()
 def measure_machine(device: torch.device, dtype: torch.dtype) -> Machine:
-    """Measure a device's bandwidth and operations per second, with as many threads as torch has in this process.
-
-    Args:
-        device: The device.
-        dtype: Number format of the matrix multiplication.
-    """
+    """Measure a device's bandwidth and operations per second, with as many threads as torch has in this process."""
 
     def rate(numbers: int) -> float:
         return 4.0 * numbers / fastest(buffer[:numbers].sum, device)
@@ -156,16 +141,11 @@ class Phase:
 
     @property
     def name(self) -> str:
-        """Name of the phase in tables."""
         if self.kind == "verify":
             return "one token" if self.rows == 1 else f"verify {self.rows}"
         return f"{self.kind} {self.rows}" if self.kind in FORWARDS[1:] else self.kind
 
     def as_dict(self) -> dict[str, float | str]:
-        """Return the fields for JSON, with the phase's name, the reached GB/s and GFLOP/s, and the share.
-
-        The share is `floor` ÷ `seconds`. It is 1 if the phase is as fast as the device allows.
-        """
         rates = {"gb_per_s": self.read / self.seconds / 1e9, "gflop_per_s": self.flops / self.seconds / 1e9}
         return {"name": self.name, **asdict(self), **rates, "share": self.floor / self.seconds}
 
@@ -178,13 +158,11 @@ class Laps(Stopwatch):
         super().__init__(device)
 
     def lap(self, phase: str) -> None:
-        """End the current lap, and add its seconds to `phase`."""
         before = self.phases[phase]
         super().lap(phase)
         self.laps.append((phase, self.phases[phase] - before))
 
     def stop(self) -> float:
-        """Stop, and return the seconds since the start."""
         seconds = super().stop()
         if self.events is not None:
             pairs = itertools.pairwise(self.events)
@@ -204,7 +182,6 @@ class Dummy(Proposer):
         self.nodes = nodes
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """Return the dummy draft; see `Proposer.propose`."""
         chain = min(self.nodes, depth)
         return Draft.of(range(self.nodes), [*range(-1, chain - 1), *[ROOT] * (self.nodes - chain)])
 
@@ -237,12 +214,6 @@ def costs_of(
     """Yield the kind, rows (both as in `Phase`) and seconds of each phase of a decode.
 
     A forward's seconds include copying the target's tokens to the CPU.
-
-    Args:
-        decoder: The decoder.
-        prompt: P, number of prompt tokens.
-        rounds: Records of the decode's rounds. A round is one forward and the draft that it verified.
-        laps: Name and seconds of each lap (interval of the stopwatch `Laps`), in order.
     """
     seconds = dict.fromkeys(("vision", "prefill", "verify", "propose"), 0.0)
     for name, lap in laps:
@@ -265,22 +236,12 @@ def costs_of(
             yield ("feed", 1 + one.accepted), feeding
 
 
-def phases_of(
-    seconds: Mapping[Key, Sequence[float]], sizes: Sizes, machine: Machine, drafts: Mapping[Key, tuple[float, float]]
-) -> Iterator[Phase]:
-    """Summarise measured times as phases, and yield these in the order of a decode.
-
-    Args:
-        seconds: Seconds of each repeat, by the kind and rows of the phase.
-        sizes: Sizes of the target.
-        machine: The device's measured bandwidth and operations per second.
-        drafts: Bytes and operations of the network that makes a draft, by the draft's kind and rows. Zeros if no
-            network makes the draft.
-    """
+def phases_of(seconds: Mapping[Key, Sequence[float]], sizes: Sizes, machine: Machine) -> Iterator[Phase]:
+    """Summarise the measured seconds of each repeat as phases, and yield these in the order of a decode."""
     order = (*FORWARDS, *source_methods())
     prompt = min(rows for kind, rows in seconds if kind == "prefill")
     for kind, rows in sorted(seconds, key=lambda key: (order.index(key[0]), key[1])):
-        read, flops = drafts.get((kind, rows)) or sizes.needs(kind, rows, prompt)
+        read, flops = sizes.needs(kind, rows, prompt)
         times = seconds[kind, rows]
         median, p95 = np.percentile(times, [50, 95])
         floor = max(machine.bounds(read, flops))
@@ -288,12 +249,6 @@ def phases_of(
 
 
 def profile_of(phases: Sequence[Phase], tokens: int) -> Profile:
-    """Return a latency profile: the median seconds of each kind of phase, by the phase's number of rows.
-
-    Args:
-        phases: Measured phases. Phases of one kind must be in increasing order of rows (`Phase.rows`).
-        tokens: N, tokens of a chunk.
-    """
     costs: dict[str, tuple[tuple[int, ...], tuple[float, ...]]] = {}
     for phase in phases:
         rows, seconds = costs.get(phase.kind, ((), ()))
@@ -302,24 +257,7 @@ def profile_of(phases: Sequence[Phase], tokens: int) -> Profile:
     return Profile(prompt, costs, tokens)
 
 
-@torch.inference_mode()
-def needs_of_draft(decoder: Any) -> tuple[float, float]:
-    """Return the bytes and the number of arithmetic operations that one prefill draft of a decoder needs.
-
-    These are the bytes and operations of the network that makes the draft. Both are 0 if no network makes it.
-    """
-    draft, target = decoder.parts.prefill_draft, decoder.target
-    if not isinstance(draft, EarlyProposer):
-        return 0.0, 0.0
-    network: Any = draft.early
-    given: Any = torch.zeros(1, target.pooled_width)
-    with FlopCounterMode(display=False) as counter:
-        copy.deepcopy(network)(given)  # a copy is not compiled
-    return stored_bytes(network.parameters()), float(counter.get_total_flops())
-
-
 def source_methods() -> dict[str, str]:
-    """Return for each kind of draft the method with which its time is measured: {"early": "early_unverified", …}."""
     return {part.cost: part.measured_by for part in ProposerPart.every().values() if part.measured_by}
 
 
@@ -339,53 +277,12 @@ def source_decoders(settings: BenchSettings) -> dict[str, Any]:
     return found
 
 
-def card_of(model: Model, machine: Machine) -> dict[str, Any]:
-    """Compute the shortest times that a model's forwards can take on this device. No forward is executed.
-
-    A shortest time (floor) has two parts in seconds: one for reading memory, one for arithmetic. The longer one counts.
-
-    Args:
-        model: The model.
-        machine: The device's measured bandwidth and operations per second.
-
-    Returns:
-        A dictionary of the model's sizes, the device's bandwidth and operations per second, and the floors. `card_rows`
-        makes a table of it.
-    """
-    prompt, tokens, sizes = model.target.max_prompt, model.size, model.sizes
-    weights = sizes.trunk_weights * sizes.weight
-    return {
-        "weights": sizes.trunk_weights,
-        "weight_bytes": weights,
-        "cache_bytes": float(sizes.cached) * (prompt + tokens) * sizes.slot,
-        "prompt": prompt,
-        "tokens": tokens,
-        "bandwidth": machine.bandwidth,
-        "bandwidth_of_weights": machine.bandwidth_of(weights),
-        "flops": machine.flops,
-        "floors": {
-            "one token": machine.bounds(*sizes.forward(1, prompt)),
-            f"verification of {tokens}": machine.bounds(*sizes.forward(tokens, prompt)),
-            "prefill": machine.bounds(*sizes.forward(prompt, 0)),
-            f"prefill and {tokens - 1} drafted": machine.bounds(*sizes.forward(prompt + tokens - 1, 0)),
-        },
-    }
-
-
 def title_of(model: Model) -> str:
-    """Return the title of the table of phases: target, number format, device, threads."""
     dtype, where = str(model.dtype).removeprefix("torch."), stamp(str(model.target.device))["device_name"]
     return f"{model.name}, {dtype}, {where}, {torch.get_num_threads()} thread, caches cold at first"
 
 
-def document(model: Model, machine: Machine, phases: Sequence[Phase]) -> dict[str, Any]:
-    """Return the results of a benchmark for JSON (docs/formats.md).
-
-    Args:
-        model: The model.
-        machine: The device's bandwidth and operations per second, from `measure`.
-        phases: The measured phases, from `measure`.
-    """
+def document(model: Model, phases: Sequence[Phase]) -> dict[str, Any]:
     device = str(model.target.device)
     return {
         "target": model.name,
@@ -394,28 +291,16 @@ def document(model: Model, machine: Machine, phases: Sequence[Phase]) -> dict[st
         "device": device,
         "threads": torch.get_num_threads(),
         **stamp(device),
-        "card": card_of(model, machine),
         "phases": list(map(Phase.as_dict, phases)),
         "profile": profile_of(phases, model.size).as_dict(),
     }
 
 
 @torch.inference_mode()
-def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Machine, list[Phase]]:
-    """Measure the time of each phase of a decode (prefill, verify, …).
-
-    All decoders run in turn, `settings.repeats` times.
-
-    Args:
-        model: The model.
-        machine: The device's measured bandwidth and operations per second. Both are measured again after the decodes;
-            the higher values count.
-        settings: Settings of the benchmark.
-
-    Returns:
-        The device's bandwidth and operations per second after all measurements, and the phases.
-    """
+def measure(model: Model, settings: BenchSettings) -> list[Phase]:
+    """Measure the time of each phase of a decode. All decoders run in turn, `settings.repeats` times."""
     device, evicting = model.target.device, torch.ones(_EVICTING)
+    machine = measure_machine(device, model.dtype)
     every, sources = decoders(model), source_decoders(settings)
     seconds: dict[Key, list[float]] = {}
     for turn in range(_WARM_UP + settings.repeats):
@@ -436,28 +321,10 @@ def measure(model: Model, machine: Machine, settings: BenchSettings) -> tuple[Ma
             for key, value in costs:
                 seconds.setdefault(key, []).append(value)
     machine = machine.best_of(measure_machine(device, model.dtype))
-    drafts = {(kind, 1): needs_of_draft(source) for kind, source in sources.items()}
-    return machine, list(phases_of(seconds, model.sizes, machine, drafts))
-
-
-def card_rows(card: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield rows (name, value): sizes of the model, rates of the device, and shortest times of forwards.
-
-    Args:
-        card: Result of `measure.card_of`.
-    """
-    yield "weights that a forward reads", f"{card['weights'] / 1e6:.1f} M, {card['weight_bytes'] / 1e6:.1f} MB"
-    yield "cache of prompt and chunk", f"{card['cache_bytes'] / 1e6:.2f} MB"
-    yield "memory, measured", f"{card['bandwidth'] / 1e9:.1f} GB/s"
-    yield "memory that holds the weights, measured", f"{card['bandwidth_of_weights'] / 1e9:.1f} GB/s"
-    yield "arithmetic, measured", f"{card['flops'] / 1e9:.0f} GFLOP/s"
-    for name, (reading, computing) in card["floors"].items():
-        why = "to read the weights" if reading >= computing else "for the arithmetic"
-        yield f"floor of {name}", f"{1e3 * max(reading, computing):.2f} ms, {why}"
+    return list(phases_of(seconds, model.sizes, machine))
 
 
 def phase_rows(phases: Sequence[Phase]) -> Iterator[dict[str, str]]:
-    """Yield a row per measured phase. The floor is the shortest time that the device allows."""
     for phase in phases:
         row = {"phase": phase.name}
         for name, seconds in (("median ms", phase.seconds), ("p95", phase.p95), ("least", phase.least)):

@@ -56,7 +56,6 @@ class Model:
 
     @property
     def sizes(self) -> Sizes:
-        """Sizes of the target, counted from its layers and its cache. An enlarged trunk counts with its new size."""
         target, drafter, cache = self.target, self.drafter, self.target.new_cache(1, 1)
         matrices = [x for x in (*target.layers.parameters(), *target.layers.buffers()) if x.dim() == 2]
         weights, head = sum(map(torch.numel, matrices)), target.width * target.actions.tokens
@@ -74,12 +73,10 @@ class Model:
 
     @property
     def size(self) -> int:
-        """N, number of tokens in a chunk."""
         return int(self.target.actions.longest(self.target.chunk))
 
     @property
     def dtype(self) -> torch.dtype:
-        """Number format of the trunk's weights."""
         return self.target.dtype
 
 
@@ -88,11 +85,6 @@ def random_target(shape: TargetSettings, device: torch.device, dtype: torch.dtyp
 
     The layers are made one after the other, so that memory never holds all weights of a large model twice. The weights
     are rounded to half precision, as the weights of the shipped targets are.
-
-    Args:
-        shape: Settings of the target: its width, layers and so on.
-        device: Device of the weights.
-        dtype: Number format of the weights.
     """
     torch.manual_seed(0)
     target = CompactTarget(replace(shape, layers=0), SPEC.actions, SPEC.observation, vocabulary(SPEC.name), "corner4")
@@ -114,11 +106,6 @@ def open_model(settings: BenchSettings) -> Model:
 
     For a shape, the model and its drafter get random weights. A policy without a drafter gets a drafter with random
     weights, too.
-
-    Raises:
-        UsageError: There is too little memory for the shape, or the policy's target has no `layers` to count.
-        UnknownName: There is neither a policy nor a shape of that name.
-        CheckpointError: The policy is damaged.
     """
     shapes = groups()["target"]
     if settings.target in shapes:
@@ -169,12 +156,10 @@ def _drafter(target: ReadableTarget) -> EagleNetwork:
 
 
 def blank(target: Any) -> Observation:
-    """Return an observation for a target. All its images are black, and all its numbers are 0."""
     return still_observation(target, target.observation, target.settings.image_size)
 
 
 def memory_of(device: torch.device) -> float:
-    """Return the bytes of memory that a device has: for a GPU the free memory, for a CPU all memory of the machine."""
     if device.type == "cuda":
         return float(torch.cuda.mem_get_info(device)[0])
     return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))

@@ -22,8 +22,7 @@ _TRUNK, _CHAIN, _LEVEL = 21, 13, 31  # kernels outside the layers, counted: of a
 _ENCODER = 20  # kernels of an encoder outside its blocks
 _ROWS = (1, 2, 4, 8, 16, 32, 64)
 SYSTEM = "system time"
-CHUNK = 64
-"""Largest number of tokens per chunk for which a computed profile has times."""
+CHUNK = 64  # largest number of tokens per chunk for which a computed profile has times
 
 
 @dataclass(frozen=True)
@@ -41,6 +40,7 @@ class Device:
     flops: float
 
 
+# Devices by short name, with the figures of NVIDIA's data sheets. Orin's rate is half of its dense int8 rate.
 DEVICES = {
     "h100": Device("H100 SXM", 3350e9, 989e12),
     "a100": Device("A100 80GB", 2039e9, 312e12),
@@ -48,7 +48,6 @@ DEVICES = {
     "3090": Device("RTX 3090", 936e9, 71e12),
     "orin": Device("AGX Orin 64GB", 204.8e9, 42.5e12),
 }
-"""Devices by short name, with the figures of NVIDIA's data sheets. Orin's rate is half of its dense int8 rate."""
 
 
 class Needs(NamedTuple):
@@ -110,21 +109,20 @@ class Engine:
         }
 
     def seconds(self, needs: Needs, device: Device) -> float:
-        """Return the seconds that a phase with these needs takes on a device."""
         times = self.times(needs, device)
         system = times.pop(SYSTEM)
         return max(times.values()) + system
 
     def bound(self, needs: Needs, device: Device) -> str:
-        """Return what takes longest in a phase with these needs, as a key of the result of `times`."""
         times = self.times(needs, device)
         return max(times, key=times.__getitem__)
 
 
+# Share of the published bandwidth and operations per second that engines are assumed to reach. gpt-fast reads 1,397
+# of an A100's 2,039 GB/s with Llama-2 7B, one sequence, in bfloat16.
 SHARE = 0.69
-"""Share of the published bandwidth and operations per second that engines are assumed to reach. gpt-fast reads 1,397 of
-an A100's 2,039 GB/s with Llama-2 7B, one sequence, in bfloat16."""
 
+# Engines by name. *tuned*: captured graphs and fused kernels. *eager*: the code that the papers measure.
 ENGINES = {
     "tuned": Engine(
         "tuned",
@@ -146,9 +144,8 @@ ENGINES = {
         "trunk takes 113 ms (A100, 7 forwards of 32 layers); HeiSD's 53 ms of system time, over encoder and 7 forwards",
     ),
 }
-"""Engines by name. *tuned*: captured graphs and fused kernels. *eager*: the code that the papers measure."""
+# An ideal engine. Every phase takes exactly its floor, the shortest time that the device allows.
 ROOFLINE = Engine("roofline", 1.0, 0.0, 0, 0, 0.0, "the floor: the longer of reading and computing")
-"""An ideal engine. Every phase takes exactly its floor, the shortest time that the device allows."""
 
 
 @dataclass(frozen=True)
@@ -182,12 +179,7 @@ class Sizes:
 
     @classmethod
     def of(cls, language: Language, number: float) -> Sizes:
-        """Return the sizes of a Llama-style target and of its drafter, which has one layer of the same shape.
-
-        Args:
-            language: Shape of the target's layers and its vocabulary.
-            number: Bytes of a weight, and of a number in the key/value cache.
-        """
+        """Return the sizes of a Llama-style target and of its drafter, which has one layer of the same shape."""
         width, layers = language.hidden_size, language.num_hidden_layers
         keys = round(width * language.key_value_heads / language.num_attention_heads)
         layer = 2 * width**2 + 2 * width * keys + 3 * width * language.intermediate_size
@@ -196,7 +188,6 @@ class Sizes:
 
     @property
     def trunk_weights(self) -> int:
-        """Number of weights that every forward reads: the layers' matrices and the head."""
         return self.layers + self.head
 
     def forward(self, rows: int, cached: int) -> tuple[float, float]:
@@ -204,10 +195,6 @@ class Sizes:
 
         Every weight, key and value counts as read once. There are two operations per weight and token, and four per
         channel of each key that a token attends to.
-
-        Args:
-            rows: Number of tokens in the forward, without `padding`. This method adds `padding` to a prefill.
-            cached: Number of earlier tokens in the cache. 0 for a prefill.
         """
         rows += 0 if cached else self.padding
         read = self.trunk_weights * self.weight + float(self.cached) * (cached + rows) * self.slot
@@ -218,11 +205,6 @@ class Sizes:
         """Return the bytes that a phase of a decode reads, and its number of arithmetic operations.
 
         Both are 0 if the phase is not a forward of the target or the drafter.
-
-        Args:
-            kind: Kind of phase, see `measure.Phase`.
-            rows: Number of tokens, or the depth of a drafted tree; see `measure.Phase`.
-            prompt: P, number of prompt tokens.
         """
         if kind in ("prefill", "verify"):
             return self.forward(rows, prompt if kind == "verify" else 0)
@@ -253,12 +235,6 @@ class Shape:
     parts: Mapping[str, Needs]
 
     def needs(self, kind: str, rows: int) -> Needs:
-        """Return what a phase needs.
-
-        Args:
-            kind: Kind of phase, see `measure.Phase`.
-            rows: Number of tokens, or the depth of a drafted tree; see `measure.Phase`.
-        """
         if kind in self.parts:
             return self.parts[kind]
         bounds = self.sizes.needs(kind, rows, self.prompt)
@@ -291,10 +267,6 @@ def encoder_of(towers: Sequence[Tower], width: int) -> Needs:
     """Return what OpenVLA's encoder needs.
 
     In each tower it runs all blocks but the last. A projector of three layers follows.
-
-    Args:
-        towers: Shapes of the encoder's vision transformers.
-        width: Width of the language model.
     """
     weights, flops, blocks, channels = 0.0, 0.0, 0, 0
     for tower in towers:
@@ -311,25 +283,12 @@ def encoder_of(towers: Sequence[Tower], width: int) -> Needs:
 
 
 def encoder_of_weights(weights: float, tokens: int) -> Needs:
-    """Return what a vision encoder of a given size reads and computes.
-
-    Args:
-        weights: Number of weights. Each is used once per token. 0 if there is no encoder.
-        tokens: Number of tokens that the encoder outputs.
-    """
     blocks = 0 if not weights else 27 if weights > 200e6 else 12  # SigLIP So400m's and ViT-B's
     return Needs(_HALF * weights, 2.0 * weights * tokens, blocks=blocks, kernels=_ENCODER * bool(weights), asks=True)
 
 
 def vla_shape(name: str, language: Language, prompt: int, encoder: Needs) -> Shape:
-    """Return the shape of a VLA in bfloat16. Its drafters and datastore have the sizes of the shipped ones.
-
-    Args:
-        name: Name of the model.
-        language: Shape of the VLA's language model.
-        prompt: P, number of prompt tokens.
-        encoder: What the VLA's vision encoder needs.
-    """
+    """Return the shape of a VLA in bfloat16. Its drafters and datastore have the sizes of the shipped ones."""
     width, sizes = language.hidden_size, Sizes.of(language, _HALF)
     # The early drafter reads two pooled vectors, has two blocks of 384 units and spreads 32 features over 7 tokens. Its
     # kernels are counted in the shipped drafter. A datastore has the shipped one's 45,221 keys of 32 numbers.
@@ -343,19 +302,14 @@ def vla_shape(name: str, language: Language, prompt: int, encoder: Needs) -> Sha
 
 
 def openvla(name: str, language: Language, towers: Sequence[Tower]) -> Shape:
-    """Return the shape of an OpenVLA: vision towers, a projector, and a Llama. Its instruction has 25 tokens."""
     encoder = encoder_of(towers, language.hidden_size)
     return vla_shape(name, language, towers[0].patches + INSTRUCTION, encoder)
 
 
-INSTRUCTION = 25
-"""Assumed number of prompt tokens of an instruction."""
-GEMMA = Language(257_152, 2048, 16_384, 18, 8, 1)
-"""PaliGemma's language model, Gemma 2B."""
+INSTRUCTION = 25  # assumed number of prompt tokens of an instruction
+GEMMA = Language(257_152, 2048, 16_384, 18, 8, 1)  # PaliGemma's language model, Gemma 2B
+# Shapes by name. The prompt of OpenVLA-7B is 256 patches and an instruction of 25 tokens.
 SHAPES = {
     "openvla-7b": openvla("openvla-7b", Language(), tuple(TOWERS.values())),
     "pi0-fast": vla_shape("pi0-fast", GEMMA, 3 * 256 + INSTRUCTION, encoder_of_weights(414e6, 3 * 256)),
 }
-"""Shapes by name. The prompt of OpenVLA-7B is 256 patches and an instruction of 25 tokens.
-
-π0-FAST reads three images of 256 patches with SigLIP So400m and a projector."""

@@ -10,8 +10,7 @@ from kerv_cli.bench.physics import DEVICES, ENGINES, ROOFLINE, SHAPES, Device, E
 from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.episodes.cost import Profile
 
-ACTION = 7
-"""Tokens of one action of OpenVLA. Published times are of one action."""
+ACTION = 7  # tokens of one action of OpenVLA. Published times are of one action.
 
 
 @dataclass(frozen=True)
@@ -36,15 +35,12 @@ class Anchor:
 
     @property
     def ours(self) -> float:
-        """The time of one action that kerv computes for this device and engine, to compare with the published time.
-
-        The unit is milliseconds.
-        """
         shape = SHAPES["openvla-7b"]
         shape = replace(shape, sizes=replace(shape.sizes, weight=self.weight))
         return 1e3 * priced(shape, DEVICES[self.device], self.engine).decode(ACTION)
 
 
+# Published times of OpenVLA-7B. `tests/test_physics.py` compares them with `ours`. docs/measuring.md has both.
 ANCHORS = (
     Anchor("h100", ROOFLINE, 30.7, 30.7, "VLA-Perf (NVIDIA, arXiv 2602.18397): vision 0.56, prefill 4.1, tokens 26.0"),
     Anchor("a100", ROOFLINE, 55.1, 55.1, "VLA-Perf: vision 1.2, prefill 11.2, tokens 42.7"),
@@ -53,7 +49,6 @@ ANCHORS = (
     Anchor("3090", ENGINES["eager"], 283, 283, "Hugging Face code (2026-07)"),
     Anchor("orin", ENGINES["tuned"], 345, 400, "2.5 to 2.9 actions per second in int4", weight=0.5),
 )
-"""Published times of OpenVLA-7B. `tests/test_physics.py` compares them with `ours`. docs/measuring.md has both."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +73,6 @@ class Projection:
 
     @property
     def document(self) -> dict[str, Any]:
-        """The projection as values for JSON (docs/formats.md)."""
         profile = self.profile.as_dict()
         for costs in profile["phases"].values():
             costs["seconds"] = [float(f"{seconds:.4g}") for seconds in costs["seconds"]]
@@ -110,7 +104,6 @@ def projections(settings: BenchSettings) -> Iterator[Projection]:
 
 
 def projection_rows(computed: Iterable[Projection]) -> Iterator[dict[str, str]]:
-    """Yield a row per computed profile."""
     for one in computed:
         row = {"profile": one.name, "device": one.device.title, "engine": one.engine.name}
         row["encoder ms"] = f"{1e3 * one.profile.seconds('encode', 1):.2f}"
@@ -121,7 +114,6 @@ def projection_rows(computed: Iterable[Projection]) -> Iterator[dict[str, str]]:
 
 
 def anchor_rows() -> Iterator[dict[str, str]]:
-    """Yield a row per published time of OpenVLA-7B, with the time that kerv computes."""
     for one in ANCHORS:
         row = {"device": DEVICES[one.device].title, "engine": one.engine.name}
         if one.weight < 1:

@@ -29,14 +29,6 @@ class BenchSettings(RunSettings):
     )
 
     def check_together(self, prefix: str) -> None:
-        """Check settings that depend on each other.
-
-        Args:
-            prefix: Start of the settings' names in error messages.
-
-        Raises:
-            UsageError: A device of `projections` does not have two positive numbers.
-        """
         for name, figures in self.projections.items():
             if len(figures) != 2 or min(figures) <= 0:
                 raise UsageError(f"{prefix}projections.{name}={figures}: two numbers above 0, GB/s and TFLOP/s")
@@ -60,7 +52,6 @@ class EstimateSettings(CommandSettings):
     on: list[str] = setting([], "instead of weights and device: profiles of 'kerv bench', as on= of 'kerv report'")
 
     def check_together(self, prefix: str) -> None:
-        """Refuse an unknown device, no probability, and a size beside measured costs."""
         if self.weights and self.on:
             raise UsageError(f"{prefix}on=PROFILE has the costs: leave out weights", f"{prefix}on")
         if not self.accepted:

@@ -9,7 +9,7 @@ import typer
 
 from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import print_rows, print_table
+from kerv_cli.cli.common import print_rows
 
 AsJson = Annotated[bool, typer.Option("--json", help="Also print the whole result as JSON, in the last line.")]
 
@@ -33,22 +33,19 @@ def bench(settings: BenchSettings, as_json: AsJson = False) -> None:
     if settings.projected != "none":
         _project(settings, as_json)
         return
-    from kerv_cli.bench.measure import card_of, card_rows, document, measure, measure_machine, phase_rows, title_of
+    from kerv_cli.bench.measure import document, measure, phase_rows, title_of
     from kerv_cli.bench.model import open_model
 
     model = open_model(settings)
-    machine = measure_machine(model.target.device, model.dtype)
-    print_table(("card", ""), card_rows(card_of(model, machine)), f"{model.name}, {model.dtype}".replace("torch.", ""))
-    machine, phases = measure(model, machine, settings)
+    phases = measure(model, settings)
     print_rows(list(phase_rows(phases)), title_of(model))
-    result = document(model, machine, phases)
+    result = document(model, phases)
     _write(settings, f"{model.name.rstrip('/').rsplit('/', 1)[-1]}-{result['dtype']}", result)
     if as_json:
         typer.echo(json.dumps(result, allow_nan=False))
 
 
 def _project(settings: BenchSettings, as_json: bool) -> None:
-    """Compute and write profiles for GPUs, and print them beside what others published."""
     from kerv_cli.bench.projections import anchor_rows, projection_rows, projections
 
     computed = list(projections(settings))
@@ -61,7 +58,6 @@ def _project(settings: BenchSettings, as_json: bool) -> None:
 
 
 def _write(settings: BenchSettings, name: str, document: dict[str, Any]) -> None:
-    """Write a result as JSON (docs/formats.md), and print its path."""
     from kerv_cli.base.files import write_json
     from kerv_cli.base.paths import results_dir
 

@@ -44,7 +44,6 @@ def constants(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
 
 
 def _print_skip(skip: SkipSection) -> None:
-    """Print when a retrieved chunk of each task may be executed without verification (docs/methods.md §4)."""
     rows: list[tuple[object, ...]] = []
     for name, task in skip.tasks.items():
         levels, figures = ("never", "-", "-"), ("-", "-")

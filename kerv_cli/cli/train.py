@@ -56,7 +56,6 @@ def drafter(settings: TrainDrafterSettings, plan: ShowPlan = False, as_json: AsJ
 
 
 def _print(folder: Path, metrics: dict[str, float], curves: Path, as_json: bool) -> None:
-    """Print the metrics of the best weights, their folder, and the paths of the training curves."""
     if as_json:
         end_with_json({"folder": folder, "best": metrics, "curves": curves})
     print_figures("best checkpoint", metrics, folder)

@@ -13,11 +13,8 @@ from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.views import frame_shape
 
+# Client's convention (setting `gripper`) -> number that means an open gripper. The negated number means closed.
 OPEN = {"signed": 1.0, "signed_inverted": -1.0}
-"""Client's convention (setting `gripper`) -> number that means an open gripper. The negated number means closed.
-
-LIBERO's simulator needs the inverted convention.
-"""
 
 
 @dataclass
@@ -25,11 +22,8 @@ class Interface:
     """What a policy reads and sends.
 
     Args:
-        description: Description of the policy.
-        spec: The policy's environment. None if kerv does not know it.
         gripper: How the gripper's value (0 closed to 1 open) is sent: `as_is`, `signed` (-1 closed, 1 open) or
             `signed_inverted` (1 closed, -1 open).
-        images_alone: Whether the policy reads images of any size and no state. Then a message may leave out the state.
 
     Attributes:
         actions: Action space of the policy.
@@ -60,11 +54,6 @@ class Interface:
 
         Args:
             image: The image, or a function that returns it. It must be (height, width, 3) uint8.
-            camera: The camera that the image belongs to.
-            key: The image's key in the message, for the error message.
-
-        Raises:
-            UsageError: The image has another shape or type.
         """
         shape = frame_shape(camera, self.size)
         image = image() if callable(image) else image
@@ -83,14 +72,6 @@ class Interface:
         """Return the proprioception (p,) and the simulator state (s,) that a client sent.
 
         A message may leave out numbers that the policy does not read. These numbers are then zero.
-
-        Args:
-            values: What the message holds under `key`. None if the message lacks the key.
-            key: Key of the state in the message, for the error message.
-            message: The whole message, for the error message.
-
-        Raises:
-            UsageError: The numbers are missing, too few, too many or not finite.
         """
         few, many = len(self.observation.proprioception), self.observation.state
         if not many or (values is None and self.images_alone):
@@ -124,7 +105,6 @@ class Interface:
 
 
 def keys_of(message: Message) -> str:
-    """Return up to eight keys of a message as text for an error message."""
     return ", ".join(sorted(str(key)[:40] for key in message)[:8]) or "nothing"
 
 

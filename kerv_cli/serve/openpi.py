@@ -33,11 +33,7 @@ def metadata(policy: Policy) -> dict[str, object]:
 
 
 def observation_of(interface: Interface, message: Message) -> Observation:
-    """Read the observation from a client's message.
-
-    Raises:
-        UsageError: A value is missing, has a wrong size or type, or is not finite. The message names the value.
-    """
+    """Read the observation from a client's message."""
     prompt = text_of(message.get(PROMPT), PROMPT)
     images = {}
     for camera in interface.cameras:
@@ -68,30 +64,13 @@ class OpenPi(Conversation):
         self.tally = Tally.of_records((), self.interface.actions.kinds)
 
     def greeting(self) -> bytes:
-        """Return the first message to the client: the encoded `metadata` of the policy."""
         return packed(metadata(self.policy))
 
     def answer(self, frame: bytes | str) -> bytes:
-        """Return the message with the actions for one observation.
-
-        Args:
-            frame: The client's websocket message.
-
-        Raises:
-            UsageError: The message or a value in it is wrong.
-        """
         return packed(self.act(unpacked(frame)))
 
     def act(self, message: Message) -> dict[str, Any]:
-        """Return the values of the answer to a client's message: actions, times, forwards and acceptance.
-
-        Args:
-            message: The observation. It may also have the key `executed` (how many actions of the latest answer were
-                executed) and the key `reset` (true begins a new episode).
-
-        Raises:
-            UsageError: A value is missing or wrong.
-        """
+        """Return the values of the answer to a client's message: actions, times, forwards and acceptance."""
         observation, executed = observation_of(self.interface, message), self._executed(message)
         hand, reset = hand_of(observation), message.get(RESET)
         if not isinstance(reset, bool | int | np.bool_ | np.integer | None):
@@ -116,18 +95,9 @@ class OpenPi(Conversation):
         return {**answer, "server_timing": timing | before}
 
     def fault(self, line: str) -> str:
-        """Return the message that tells the client about an error. `line` is the error's text."""
         return f"kerv: {line}"
 
     def _executed(self, message: Message) -> np.ndarray:
-        """Return the actions that the robot has executed since the latest answer.
-
-        These are the first `executed` actions of the latest answer. Without the key `executed` in the message, these
-        are all actions of that answer.
-
-        Raises:
-            UsageError: `executed` is not a whole number from 0 to the number of actions of the latest answer.
-        """
         count = message.get(EXECUTED, len(self.last))
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 0 <= count <= len(self.last):
             raise UsageError(

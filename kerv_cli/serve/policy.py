@@ -30,12 +30,11 @@ from kerv_cli.targets import TargetPart
 from kerv_cli.targets.provenance import stamp
 from kerv_cli.worlds import specs
 
-VLA_EVAL = "vla_eval"
-"""The protocol in which clients name the task of every episode."""
+VLA_EVAL = "vla_eval"  # the protocol in which clients name the task of every episode
+# Number of decodes before a new decoder serves. First decodes are slow: they allocate memory and choose kernels.
 WARM_UP = 4
-"""Number of decodes before a new decoder serves. First decodes are slow: they allocate memory and choose kernels."""
+# Width assumed for the range of a number that hardly varied in the demonstrations, in the number's own unit
 LEAST_WIDTH = 1.0
-"""Width assumed for the range of a number that hardly varied in the demonstrations, in the number's own unit."""
 
 
 class Policy:
@@ -51,12 +50,6 @@ class Policy:
             demonstrations plus a margin. (s,) if the policy reads the whole simulator state. Empty if the checkpoint
             stores no range, or if the policy reads no state.
         high: Upper ends of these ranges, of the same shape.
-
-    Raises:
-        UnknownName: The policy's environment has no task with that name.
-        UsageError: There is no such policy, a setting is out of range, parts of the method do not fit together, or a
-            task must be named.
-        CheckpointError: The policy is damaged, or an artifact is missing or belongs to another policy.
     """
 
     def __init__(self, settings: ServeSettings) -> None:
@@ -102,16 +95,11 @@ class Policy:
         return decoder
 
     def take_back(self, decoder: Decoder) -> None:
-        """Keep a client's decoder for the next client. A decoder that depends on the task is dropped."""
         if not self.by_task:
             self._idle.append(decoder)
 
     def check_range(self, observation: Observation) -> None:
-        """Check that the state in an observation is in the range in which the policy may act.
-
-        Raises:
-            UsageError: A number of the state is out of range. The message names the first such number.
-        """
+        """Check that the state in an observation is in the range in which the policy may act."""
         numbers, names = observation.state[: len(self.low)], self.interface.observation.proprioception
         for first in np.flatnonzero((numbers < self.low) | (numbers > self.high)).tolist():
             name = names[first] if first < len(names) else f"number {first}"
@@ -121,15 +109,7 @@ class Policy:
             )
 
     def decode(self, decoder: Decoder, observation: Observation) -> DecodeRecord:
-        """Decode the observation of one client. Calls from several threads wait for each other.
-
-        Args:
-            decoder: The decoder that `lend_decoder` returned for this client.
-            observation: The client's observation.
-
-        Raises:
-            KervError: The decode computed NaN or infinite numbers.
-        """
+        """Decode the observation of one client. Calls from several threads wait for each other."""
         with self._turn:
             record = decoder.decode(observation)
             target: Any = decoder.target
@@ -157,24 +137,17 @@ class Finite:
         return getattr(self._target, name)
 
     def encode(self, observation: Observation) -> Tensor:
-        """Return the target's prompt. The next call of `check` raises an error if a number in it is not finite."""
         return self._noted(self._target.encode(observation))
 
     def head(self, hidden: Tensor) -> Tensor:
-        """Return the target's logits. The next call of `check` raises an error if a logit is not finite."""
         return self._noted(self._target.head(hidden))
 
     def _noted(self, numbers: Tensor) -> Tensor:
-        """Start to check whether numbers are finite, without waiting for the device. Return the numbers unchanged."""
         self._fine.append(torch.isfinite(numbers).all())
         return numbers
 
     def check(self) -> None:
-        """Check all prompts and logits since the last call.
-
-        Raises:
-            KervError: A number is NaN or infinite.
-        """
+        """Check all prompts and logits since the last call."""
         fine, self._fine = self._fine, []
         if fine and not bool(torch.stack(fine).all()):
             raise KervError("the policy computed numbers that are not finite: no action is sent")
@@ -203,35 +176,24 @@ class Conversation(abc.ABC):
         self.decoder: Any = None if policy.by_task else policy.lend_decoder(self.task)
 
     def close(self) -> None:
-        """Give the decoder back for the next client."""
         self.policy.take_back(self.decoder)
 
     def begin(self, task: str, seed: int, hand: np.ndarray) -> None:
         """Begin an episode.
 
         Args:
-            task: Name of the task. May be empty if the method does not depend on it.
-            seed: Seed of the episode.
             hand: (3,) position of the end effector in metres.
-
-        Raises:
-            CheckpointError: The method was not calibrated for the task.
         """
         if self.policy.by_task and (self.decoder is None or task != self.task):
             self.decoder, self.task = self.policy.lend_decoder(task), task
         self.decoder.reset(self.task or task, seed, hand)
 
     def greeting(self) -> bytes | None:
-        """Return the first message that the server sends. None if the client speaks first."""
         return None
 
     @abc.abstractmethod
     def answer(self, frame: bytes | str) -> bytes | None:
-        """Return the answer to a websocket message, or None if it needs no answer.
-
-        Raises:
-            KervError: Something is wrong with the message.
-        """
+        """Return the answer to a websocket message, or None if it needs no answer."""
 
     @abc.abstractmethod
     def fault(self, line: str) -> bytes | str:

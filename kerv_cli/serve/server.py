@@ -31,28 +31,18 @@ except ImportError as error:
 
 PROTOCOLS = {"openpi": "kerv_cli.serve.openpi:OpenPi", "vla_eval": "kerv_cli.serve.vla_eval:VlaEval"}
 HEALTH = ("/healthz", "/health")
-BUSY, GONE = 1013, 1001
-"""Websocket close codes: 1013 means "try again later", 1001 "going away"."""
-LARGEST_MESSAGE = 16 * 2**20
-"""Largest size of a client's message, in bytes."""
-LONGEST = 500
-"""Largest length of an error message, in characters. An error message may quote long texts, so it is cut."""
+BUSY, GONE = 1013, 1001  # websocket close codes: 1013 means "try again later", 1001 "going away"
+LARGEST_MESSAGE = 16 * 2**20  # largest size of a client's message, in bytes
+LONGEST = 500  # largest length of an error message, in characters. An error message may quote long texts, so it is cut.
+# Seconds for which a new client waits until another client leaves. Its own old connection may still be closing.
 PATIENCE = 1.0
-"""Seconds for which a new client waits until another client leaves. Its own old connection may still be closing."""
-FAREWELL = 2.0
-"""Seconds for which the server waits for one client to close its connection."""
+FAREWELL = 2.0  # seconds for which the server waits for one client to close its connection
+# Seconds for which a stopping server waits for answers that are being computed, and for clients to disconnect
 LAST_ANSWERS = 0.5
-"""Seconds for which a stopping server waits for answers that are being computed, and for clients to disconnect."""
 
 
 class PolicyServer:
-    """Serve one policy to clients.
-
-    Args:
-        policy: The policy.
-        settings: Settings of the server.
-        log: Called with every line of the log.
-    """
+    """Serve one policy to clients."""
 
     def __init__(self, policy: Policy, settings: ServeSettings, log: Callable[[str], None]) -> None:
         self.policy, self.settings, self.log = policy, settings, log
@@ -66,13 +56,6 @@ class PolicyServer:
 
         All threads are daemons. No client can delay the end by more than LAST_ANSWERS seconds, even during the client's
         handshake.
-
-        Args:
-            host: Address to listen on.
-            port: Port to listen on. 0 chooses a free one.
-
-        Raises:
-            UsageError: The address cannot be used.
         """
         try:
             server = serve(
@@ -131,17 +114,6 @@ class PolicyServer:
             self.log(f"{who} disconnected{why}; {_summary(times)}")
 
     def _talk(self, connection: ServerConnection, who: str, times: list[float]) -> None:
-        """Answer messages until the connection ends. If a message is wrong, the answer says what is wrong.
-
-        Args:
-            connection: The connection.
-            who: The client's address, for the log.
-            times: List to which the milliseconds of every answer are appended.
-
-        Raises:
-            ConnectionClosed: The client has left.
-            TimeoutError: The client was silent for too long.
-        """
         with contextlib.closing(self.protocol(self.policy)) as conversation:
             if (greeting := conversation.greeting()) is not None:
                 connection.send(greeting)
@@ -162,12 +134,10 @@ class PolicyServer:
 
 
 def _start(function: Callable[..., object], *arguments: object) -> None:
-    """Call a function in a new daemon thread. Threads that the function starts are daemons, too."""
     threading.Thread(target=function, args=arguments, daemon=True).start()
 
 
 def _summary(times: list[float]) -> str:
-    """Return the number of answers and their times as text for the log. `times` are in milliseconds."""
     if not times:
         return "0 answers"
     p50, p95 = np.percentile(times, [50, 95])
@@ -175,7 +145,6 @@ def _summary(times: list[float]) -> str:
 
 
 def _address(connection: ServerConnection) -> str:
-    """Return the client's address as text for the log."""
     try:
         return str(connection.remote_address)
     except OSError:
@@ -183,8 +152,6 @@ def _address(connection: ServerConnection) -> str:
 
 
 def _one_line_logger(log: Callable[[str], None]) -> logging.Logger:
-    """Return a logger for websockets that writes each error as one line without a traceback."""
-
     class Lines(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
             log(f"a connection failed: {record.exc_info[1] if record.exc_info else record.getMessage()}"[:LONGEST])
@@ -195,5 +162,4 @@ def _one_line_logger(log: Callable[[str], None]) -> logging.Logger:
 
 
 def _health(connection: ServerConnection, request: Request) -> Response | None:
-    """Answer an HTTP request to /healthz or /health. Return None for any other request: it opens a websocket."""
     return connection.respond(http.HTTPStatus.OK, "OK\n") if request.path in HEALTH else None

@@ -21,10 +21,9 @@ from kerv_cli.serve.interface import OPEN, Interface, hand_of, keys_of, text_of
 from kerv_cli.serve.policy import Conversation, Policy
 
 PROTOCOL_VERSION = 1
-MOST_STEPS = 20_000
-"""Largest number of control steps of an episode."""
+MOST_STEPS = 20_000  # largest number of control steps of an episode
+# (Name of a group of DoFs, number of DoFs) -> vla-eval's name for the format of the group's values
 _FORMATS = {("position", 3): "delta_xyz", ("rotation", 3): "axis_angle"}
-"""(Name of a group of DoFs, number of DoFs) -> vla-eval's name for the format of the group's values."""
 
 
 def dim_specs(interface: Interface) -> dict[str, dict[str, dict[str, object]]]:
@@ -49,7 +48,6 @@ def dim_specs(interface: Interface) -> dict[str, dict[str, dict[str, object]]]:
 
 
 def _gripper_format(interface: Interface) -> str:
-    """Return vla-eval's name for the format of the gripper's value."""
     closes = interface.grip[0] if interface.grip else 0.0
     if interface.gripper in OPEN:
         closes = -OPEN[interface.gripper]
@@ -95,11 +93,7 @@ class VlaEval(Conversation):
         self.sequence = 0
 
     def answer(self, frame: bytes | str) -> bytes | None:
-        """Return the answer to a message, or None if it needs no answer.
-
-        Raises:
-            KervError: Something is wrong with the message.
-        """
+        """Return the answer to a message, or None if it needs no answer."""
         message = unpacked(frame)
         kind, payload, sequence = str(message.get("type")), message.get("payload"), message.get("seq")
         self.sequence = sequence if isinstance(sequence, int) else 0
@@ -108,20 +102,13 @@ class VlaEval(Conversation):
         return _HANDLERS[kind](self, payload)
 
     def fault(self, line: str) -> bytes:
-        """Return the message that ends the client's episode because of an error. `line` is the error's text."""
         return self._message("error", {"error": line})
 
     def _message(self, kind: str, payload: Mapping[str, object]) -> bytes:
-        """Encode a message to the client: its type is `kind`, its content is `payload`."""
         message = {"type": kind, "payload": payload, "seq": self.sequence, "timestamp": time.time()}
         return packed(message, text_keys=True)
 
     def _hello(self, payload: Message) -> bytes:
-        """Answer the first message of a connection with what the policy reads and sends.
-
-        Raises:
-            UsageError: The client speaks another version of the protocol.
-        """
         number = payload.get("protocol_version")
         if number != PROTOCOL_VERSION:
             raise UsageError(
@@ -134,18 +121,9 @@ class VlaEval(Conversation):
         return self._message("hello", about)
 
     def _start(self, payload: Message) -> None:
-        """Begin a new episode.
-
-        A decoder for the episode's task is built at the first observation. Only then are errors in `payload` reported.
-        """
         self.episode = _Episode(payload)
 
     def _observe(self, payload: Message) -> bytes:
-        """Return the next action. If all actions of the last chunk have been sent, decode this observation first.
-
-        Raises:
-            UsageError: Something is wrong with the observation, or the episode already has MOST_STEPS control steps.
-        """
         episode = self.episode = self.episode or _Episode({})
         if episode.steps >= MOST_STEPS:
             raise UsageError(f"the episode has {MOST_STEPS} control steps, the most: send episode_end or episode_start")
@@ -169,7 +147,6 @@ class VlaEval(Conversation):
         return self._message("action", {"actions": sent})
 
     def _observation(self, payload: Message, numbers: tuple[np.ndarray, np.ndarray]) -> Observation:
-        """Read a message. `numbers`: proprioception (p,) and simulator state (s,), already checked."""
         images = payload.get("images")
         images = images if isinstance(images, dict) else {}
         instruction = text_of(payload.get("task_description"), "task_description")
@@ -181,7 +158,6 @@ class VlaEval(Conversation):
         return Observation(*numbers, instruction, frames)
 
     def _end(self, payload: Message) -> None:
-        """End the episode, and tell the method's parts whether it succeeded."""
         episode, self.episode = self.episode, None
         metrics = payload.get("metrics")
         if episode is not None and episode.begun:

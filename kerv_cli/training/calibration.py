@@ -44,26 +44,17 @@ from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.files import DemoEpisode
 
+# Parts of the method that decodes to measure K_S, the reference level of the kinematic variability K
 DRAFTS = {"proposer": "drafter", "acceptance": "relaxed", "threshold": "fixed"}
-"""Parts of the method that decodes to measure K_S, the reference level of the kinematic variability K."""
-PRESAMPLED = 6
-"""The decodes that measure K_S are spread over about this many episodes per task."""
+PRESAMPLED = 6  # the decodes that measure K_S are spread over about this many episodes per task
 
-ENTRIES = 4000
-"""Maximum number of datastore entries looked up per task, evenly spread.
-
-On MT10, skip levels derived from 1000 entries allowed too many wrong chunks in other episodes.
-"""
-LEAST = 20
-"""Minimum number of matches from which a skip level (similarity at which verification is skipped) is derived."""
+ENTRIES = 4000  # maximum number of datastore entries looked up per task, evenly spread
+LEAST = 20  # minimum number of matches from which a skip level (similarity at which verification is skipped) is derived
+# The lower and the upper bound of s_min allow this many times the share of wrong chunks that s_min allows
 LOW, HIGH = 2.0, 1 / 3
-"""The lower and the upper bound of s_min allow this many times the share of wrong chunks that s_min allows.
 
-s_min is the smallest similarity at which verification is skipped.
-"""
-
+# Grid of the Kalman filter's ratio q / r (process noise to measurement noise), with r = 1
 RATIOS = np.logspace(-3, 3, 49)
-"""Grid of the Kalman filter's ratio q / r (process noise to measurement noise), with r = 1."""
 
 
 def plan_calibration(
@@ -150,23 +141,7 @@ def presample(
     decodes: int,
     progress: OnProgress,
 ) -> dict[str, stored.Variability]:
-    """Measure how far drafts are from the target's tokens, by decoding observations of training episodes.
-
-    Args:
-        decoder: The decoder.
-        dataset: The demonstrations.
-        chosen: Indices of the episodes that are used.
-        tasks: Full names of the tasks.
-        decodes: Number of decodes per task.
-        progress: Called with two numbers: finished tasks, all tasks.
-
-    Returns:
-        The reference level K_S of each task. K is the distance between a draft and the target's tokens. K_S is the
-        median of K over the task's decodes.
-
-    Raises:
-        KervError: No decode of a task compared a draft with the target.
-    """
+    """Measure how far drafts are from the target's tokens, by decoding observations of training episodes."""
     variability = {}
     for number, name in enumerate(tasks, 1):
         records: list[DecodeRecord] = []
@@ -186,11 +161,6 @@ def reference_level(records: Sequence[DecodeRecord], actions: ActionSpace, chunk
 
     Decoding divides by K_S, so it must not be 0. It is at least the smallest possible K above 0, which is the K of a
     chunk in which a single token is off by one bin.
-
-    Args:
-        records: Decodes of the task.
-        actions: The target's action space.
-        chunk: The target's number of control steps per chunk.
     """
     bin_width, moving = 2.0 / actions.tokens, chunk * int((~actions.is_strict).sum())
     levels = {}
@@ -207,12 +177,6 @@ def episode_decodes(decoder: Decoder, dataset: DemoDataset, index: int, decodes:
 
     The decoder also gets every action executed between these observations, because some methods use a history. A decode
     that compared no draft with the target is left out.
-
-    Args:
-        decoder: The decoder.
-        dataset: The demonstrations.
-        index: Index of the episode in the dataset.
-        decodes: Maximum number of observations to decode.
     """
     episode = dataset.load(index)
     rows = np.unique(np.linspace(0, len(episode.frame_steps) - 1, decodes).round().astype(int))
@@ -232,17 +196,6 @@ def episode_decodes(decoder: Decoder, dataset: DemoDataset, index: int, decodes:
 def fit_boundary(
     paths: list[np.ndarray], windows: Sequence[int], old: stored.Calibration | None, progress: OnProgress
 ) -> stored.BoundarySection:
-    """Return the ranges of the hand's curvature and path length, for each window length.
-
-    Args:
-        paths: Positions of the end effector in each episode, (T, 3) metres.
-        windows: Window lengths, in positions.
-        old: An earlier calibration. The ranges in it are kept. None if there is no earlier calibration.
-        progress: Called with two numbers: finished window lengths, all window lengths.
-
-    Raises:
-        CheckpointError: No path is curved, or the hand never moves.
-    """
     known = old.boundary.windows if old is not None and old.boundary is not None else {}
     ranges = dict(known)
     for number, window in enumerate(windows, 1):
@@ -279,19 +232,8 @@ def episode_windows(episode: DemoEpisode, actions: ActionSpace, window: int, hor
     The last moments of an episode have fewer than `horizon` actions left. The missing actions come from the end of
     the recording, which holds further actions of the expert after the episode's last control step.
 
-    Args:
-        episode: A demonstration.
-        actions: The action space, to normalise actions.
-        window: Number of control steps before the moment.
-        horizon: Number of control steps from the moment on, H.
-
     Returns:
         (n, window + horizon, D) float32: the expert's normalised actions around each of the n moments, oldest first.
-        They do not include the noise that was added when the robot executed them.
-
-    Raises:
-        CheckpointError: The recording holds fewer than H − 1 further actions of the expert after the last control step.
-            The last moment would then have fewer than H actions.
     """
     steps, length = len(episode.executed), window + horizon
     check_tail(episode, horizon, f"predictions of {horizon} steps")
@@ -306,22 +248,9 @@ def read_windows(
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], dict[str, dict[str, int]]]:
     """Read the expert's actions around n moments (control steps) of episodes, see `episode_windows`.
 
-    Args:
-        dataset: The demonstrations.
-        chosen: Indices of the episodes in the dataset.
-        actions: The action space, to normalise actions.
-        window: Number of control steps before each moment.
-        horizon: Number H of control steps from each moment on.
-        progress: Called with two numbers: episodes read, all episodes.
-
     Returns:
         Normalised actions of D DoFs before each moment (n, window, D) and from it on (n, H, D). The end effector's
         positions in each episode, (T, 3) metres. The number of episodes of each task, as in `Demonstrations`.
-
-    Raises:
-        KervError: A task has no episode that is longer than the window.
-        CheckpointError: A recording is damaged. Or it holds fewer than H − 1 further actions of the expert after the
-            episode's last control step, so that the last moment would have fewer than H actions.
     """
     counts: dict[str, dict[str, int]] = {}
     parts, paths = [], []
@@ -338,16 +267,6 @@ def read_windows(
 
 
 def choose_episodes(dataset: DemoDataset, tasks: Sequence[str], limit: int) -> list[int]:
-    """Return the indices of the first episodes of each task.
-
-    Args:
-        dataset: The demonstrations.
-        tasks: Full names of the tasks.
-        limit: Maximum number of episodes per task. If 0, all episodes are taken.
-
-    Raises:
-        CheckpointError: A task has no demonstration.
-    """
     check_tasks(dataset, tasks)
     chosen: list[int] = []
     for task in tasks:
@@ -371,12 +290,6 @@ def fit_noise(past: np.ndarray, future: np.ndarray) -> float:
 
 
 def fit_filters(past: np.ndarray, future: np.ndarray) -> dict[str, Noise]:
-    """Fit the Kalman filter of every DoF, strict DoFs included.
-
-    Args:
-        past: (n, window, D) normalised actions before each of n moments.
-        future: (n, H, D) normalised actions from each moment on, which the filter should predict.
-    """
     ratios = tuple(fit_noise(past[..., dof], future[..., dof]) for dof in range(past.shape[2]))
     return {"kalman": Noise(ratios, (1.0,) * len(ratios))}
 
@@ -397,13 +310,7 @@ class Matches:
 def match(store: Datastore, task: str, epsilon: float) -> Matches:
     """Compare each datastore entry of a task with the most similar entry of another episode (docs/methods.md §4.3).
 
-    In a rollout, the chunk of the most similar entry would be executed without verification. Here it is compared with
-    the entry's own chunk, which holds the expert's next actions. At most ENTRIES entries are compared. If the task has
-    only one episode, there are no matches.
-
     Args:
-        store: The datastore.
-        task: Full name of the task.
         epsilon: Largest mean absolute error of a good match, in normalised action units.
     """
     shard = store.shards[task]
@@ -420,16 +327,7 @@ def match(store: Datastore, task: str, epsilon: float) -> Matches:
 
 
 def lowest_level(matches: Matches, confidence: float, least: int = LEAST) -> float | None:
-    """Find the lowest similarity s for which enough of the matches with a similarity of s or more are good.
-
-    Args:
-        matches: The task's matches.
-        confidence: Minimum share of good matches among those with similarity ≥ s.
-        least: Minimum number of matches with similarity ≥ s.
-
-    Returns:
-        The similarity s. None if there are not enough good matches for any s.
-    """
+    """Find the lowest similarity s for which enough of the matches with a similarity of s or more are good."""
     order = np.argsort(-matches.similarity, kind="stable")
     ranked = matches.similarity[order]
     above = np.arange(1, len(ranked) + 1)
@@ -439,21 +337,7 @@ def lowest_level(matches: Matches, confidence: float, least: int = LEAST) -> flo
 
 
 def task_levels(matches: Matches, confidence: float) -> stored.SkipLevel:
-    """Return a task's s_min, the smallest similarity at which verification is skipped, and its bounds.
-
-    In a rollout, a skip rule may lower s_min after a success and raise it after a failure, between the bounds `low` and
-    `high`. Each of these three numbers (`low`, s_min, `high`) is a similarity with its own limit on wrong chunks. It is
-    the smallest similarity for which the share of wrong chunks, among the matches that reach it, is within the limit.
-    At least LEAST matches must reach it. With a confidence of 0.9 the limits are 0.1 for s_min, 0.2 (twice as much) for
-    `low`, and 0.033 (a third) for `high`.
-
-    If no similarity is within the limit for `high`, then `high` is the largest similarity of all matches. If no
-    similarity is within the limit for s_min, all three numbers are NEVER, and the task never skips verification.
-
-    Args:
-        matches: The task's matches.
-        confidence: Minimum share of good chunks among the chunks that are executed without verification.
-    """
+    """Return a task's s_min, the smallest similarity at which verification is skipped, and its bounds."""
     similarity, wrong = matches.similarity, 1 - confidence
     s_min = lowest_level(matches, confidence)
     if s_min is None:
@@ -474,18 +358,6 @@ def task_levels(matches: Matches, confidence: float) -> stored.SkipLevel:
 def skip_section(
     store: Datastore, tasks: Sequence[str], epsilon: float, confidence: float, progress: OnProgress
 ) -> stored.SkipSection | None:
-    """Return the thresholds at which verification is skipped, for each of `tasks` that the datastore holds.
-
-    Args:
-        store: The datastore.
-        tasks: Full names of the tasks.
-        epsilon: Largest mean absolute error of a good chunk, in normalised action units.
-        confidence: Minimum share of good chunks among the chunks that are executed without verification.
-        progress: Called with two numbers: finished tasks, all tasks.
-
-    Returns:
-        The thresholds. None if the datastore holds none of the tasks.
-    """
     levels = {}
     for done, task in enumerate(tasks, 1):
         if task in store.shards:

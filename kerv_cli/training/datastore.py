@@ -30,8 +30,7 @@ from kerv_cli.training.settings import BuildDatastoreSettings, Plan, Stage
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.files import DemoEpisode
 
-BATCH = 128
-"""Maximum number of observations that are encoded together."""
+BATCH = 128  # maximum number of observations that are encoded together
 
 
 def plan_datastore(settings: BuildDatastoreSettings, database: Database) -> Plan[tuple[Path, stored.Datastore]]:
@@ -105,18 +104,7 @@ def plan_datastore(settings: BuildDatastoreSettings, database: Database) -> Plan
 
 @torch.inference_mode()
 def entries_of(target: Any, episode: DemoEpisode, space: ObservationSpace, key: Sequence[str]) -> dict[str, np.ndarray]:
-    """Make the entries of an episode: one for every observation.
-
-    Args:
-        target: The target.
-        episode: The episode.
-        space: Observation space of the demonstrations.
-        key: Names of the parts of the prompt that form the search key.
-
-    Returns:
-        The values of each column, one row per entry. The column `keys` holds the encoded observations, and `tokens` the
-        expert's next H actions without added noise.
-    """
+    """Make the entries of an episode: one for every observation."""
     steps = observed_steps(episode, bool(target.cameras))
     tokens = target.actions.chunk_tokens(read_chunks(episode, steps, target.chunk))
     observations = observations_of(target, episode, steps, space)
@@ -133,13 +121,7 @@ def entries_of(target: Any, episode: DemoEpisode, space: ObservationSpace, key: 
 
 
 def write_files(folder: Path, parts: Sequence[Mapping[str, np.ndarray]], settings: BuildDatastoreSettings) -> int:
-    """Write the files of a datastore into a folder, except the manifest. Return the width of a key.
-
-    Args:
-        folder: The folder.
-        parts: The entries of each episode, as `entries_of` returns them.
-        settings: Settings of `kerv build datastore`.
-    """
+    """Write the files of a datastore into a folder, except the manifest. Return the width of a key."""
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     keys, tokens, arrays = columns.pop("keys"), columns.pop("tokens"), {}
     if settings.components:

@@ -47,23 +47,11 @@ S = TypeVar("S", bound=DemonstrationSettings)
 
 
 def name_of(tasks: Sequence[str]) -> str:
-    """Return the name that demonstrations of these tasks and suites get by default, such as `mt10`."""
     return "-".join(tasks or DEFAULT_TASKS).lower()
 
 
 def open_demos(database: Database, names: str, tasks: Sequence[str] = (), episodes: int = 0) -> DemoDataset:
-    """Open a dataset, or join several datasets, such as `mt50+mt50-dagger`.
-
-    Args:
-        database: The database of the results folder.
-        names: Name of a dataset, or several names joined by `+`.
-        tasks: Tasks that the error message tells to record if the dataset is missing. Empty for the default tasks.
-        episodes: Episodes per task that the error message tells to record. 0 for the default number.
-
-    Raises:
-        UsageError: A name cannot be the name of a folder.
-        CheckpointError: A dataset is missing, unfinished or damaged, or the datasets cannot be joined.
-    """
+    """Open a dataset, or join several datasets, such as `mt50+mt50-dagger`."""
     results, parts = str(database.results), names.split("+")
     if artifact_or_path(results, "demos", names).is_dir():  # its name may contain a plus
         parts = [names]
@@ -85,7 +73,6 @@ def open_demos(database: Database, names: str, tasks: Sequence[str] = (), episod
 
 
 def _remedy(parent: Path, folder: Path, tasks: Sequence[str], episodes: int) -> str:
-    """Return the end of an error message: what to type if `folder` is no dataset. `parent` holds all datasets."""
     if folder.parent != parent:
         return "name a folder that holds manifest.json"
     tasks = [folder.name] if stands_for_tasks(folder.name) else tasks
@@ -102,22 +89,7 @@ def _remedy(parent: Path, folder: Path, tasks: Sequence[str], episodes: int) -> 
 
 
 def demos_for(settings: S, target: TargetDescription, database: Database) -> tuple[S, DemoDataset]:
-    """Open the demonstrations named in the settings, or by default the ones that the target was trained on.
-
-    Args:
-        settings: Settings of the command.
-        target: Description of the target.
-        database: The database of the results folder.
-
-    Returns:
-        settings: The settings with `demos` filled in. If `task` is empty and the demonstrations have tasks that
-            the target was not trained on, `task` becomes the recorded tasks that the target was trained on.
-        dataset: The demonstrations.
-
-    Raises:
-        CheckpointError: The demonstrations are missing, unfinished, damaged, of another environment, or show other
-            camera views than the target sees. Or they hold no episode of a task.
-    """
+    """Open the demonstrations named in the settings, or by default the ones that the target was trained on."""
     name, tasks = settings.demos or target.demos or name_of(()), settings.task
     if settings.demos:
         dataset = open_demos(database, name, tasks or target.tasks)
@@ -138,15 +110,7 @@ def demos_for(settings: S, target: TargetDescription, database: Database) -> tup
 
 
 def check_tasks(dataset: DemoDataset, names: Sequence[str]) -> None:
-    """Refuse demonstrations unless every task in `names` has an episode.
-
-    Args:
-        dataset: The demonstrations.
-        names: Full names of the tasks.
-
-    Raises:
-        CheckpointError: A task has no episode. The message names the first such task.
-    """
+    """Refuse demonstrations unless every task in `names` has an episode."""
     for task in names:
         if not dataset.of_tasks(task):
             recorded = ", ".join(dataset.manifest.tasks)
@@ -160,15 +124,6 @@ def check_spaces(dataset: DemoDataset, actions: ActionSpace, observation: Observ
     """Refuse demonstrations with another action space or observation space than expected.
 
     Demonstrations without object positions need only the same proprioception.
-
-    Args:
-        dataset: The demonstrations.
-        actions: Expected action space.
-        observation: Expected observation space.
-        owner: Whose spaces are expected, such as "the target", for the error message.
-
-    Raises:
-        CheckpointError: The actions or the observations differ.
     """
     where = f"the demonstrations in {dataset.path}"
     dataset.manifest.actions.check_same(actions, where, owner)
@@ -179,17 +134,7 @@ def check_spaces(dataset: DemoDataset, actions: ActionSpace, observation: Observ
 
 
 def seen_by(dataset: DemoDataset, camera: str, who: str, remedy: str) -> DemoDataset:
-    """Return the dataset with only the views of `camera`, which must be the leftmost views in each image.
-
-    Args:
-        dataset: The demonstrations.
-        camera: Camera name. Several views are joined by `+`.
-        who: Words of the error message before `camera`, such as "the target sees".
-        remedy: End of the error message: what to do.
-
-    Raises:
-        CheckpointError: The first recorded views are not those of `camera`.
-    """
+    """Return the dataset with only the views of `camera`, which must be the leftmost views in each image."""
     recorded = dataset.manifest.config["camera"]["name"]
     if recorded == camera:
         return dataset
@@ -206,17 +151,12 @@ class PolicyActor:
 
     Task and seed determine in which chunks the expert acts. The decoder is never told whether an episode succeeded, so
     no episode depends on earlier episodes.
-
-    Args:
-        decoder_of: Function that takes a task's name and makes the decoder of this task.
-        expert_share: Share of the chunks in which the expert acts.
     """
 
     def __init__(self, decoder_of: Callable[[str], Decoder], expert_share: float) -> None:
         self.decoder_of, self.share = functools.cache(decoder_of), expert_share
 
     def reset(self, world: World, seed: int) -> None:
-        """Begin an episode. The world must have been reset already."""
         self.world = world
         self.random = np.random.default_rng([seed, *world.task.encode()])
         # actions of the current chunk that are not executed yet; None: the expert acts
@@ -262,15 +202,6 @@ class PolicyActs:
         """Check that the policy can act in an environment. Return the `PolicyActs` of the recording.
 
         The recording may contain more camera views than the target sees, to train another target on them.
-
-        Args:
-            settings: Settings of the recording.
-            spec: The environment.
-
-        Raises:
-            UsageError: The target does not exist, the recording shows another camera than the target sees, or the
-                method does not work with the target.
-            CheckpointError: An artifact is missing or damaged, or the policy is of another environment.
         """
         name, world = settings.policy.target, settings.world
         description = _artifacts(settings).description
@@ -286,11 +217,6 @@ class PolicyActs:
         return cls(settings, _hash(settings))
 
     def __call__(self, config: DemoConfig) -> PolicyActor:
-        """Make the actor of a recording.
-
-        Raises:
-            CheckpointError: The policy's weights have changed since the recording began.
-        """
         set_up(self.settings.runtime)
         if _hash(self.settings) != self.sha256:
             raise CheckpointError(
@@ -334,14 +260,7 @@ def plan_demos(settings: DemosSettings) -> Plan[tuple[Path, DemoManifest]]:
 
 
 def recording_of(settings: DemosSettings) -> tuple[DemoConfig, PolicyActs | None]:
-    """Return the description of a recording, and the policy that acts in it. The policy is None if the expert acts.
-
-    Raises:
-        UnknownName: A task does not exist.
-        UsageError: `policy.target` is set although the expert acts. Or the policy does not exist or cannot act, see
-            `PolicyActs.of`.
-        CheckpointError: An artifact is missing or damaged, or the policy is of another environment.
-    """
+    """Return the description of a recording, and the policy that acts in it. The policy is None if the expert acts."""
     tasks, target = resolve_tasks(settings.task), settings.policy.target
     actor = None
     if settings.policy.kind != EXPERT:

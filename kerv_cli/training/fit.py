@@ -34,27 +34,19 @@ from kerv_cli.training.settings import TrainSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
 Metrics = dict[str, float]
+# Takes the number of an optimisation step. Returns the loss (a scalar) of that step's batch, and metrics to log.
 Loss = Callable[[int], tuple[Tensor, Metrics]]
-"""Takes the number of an optimisation step. Returns the loss (a scalar) of that step's batch, and metrics to log."""
+# Takes the network. Returns metrics on held-out samples. The best weights are those with the highest `score`.
 Validate = Callable[[Any], Metrics]
-"""Takes the network. Returns metrics on held-out samples. The best weights are those with the highest `score`."""
-Save = Callable[[Any, Metrics], None]
-"""Takes the network and the metrics of its validation, and writes its weights."""
+Save = Callable[[Any, Metrics], None]  # takes the network and the metrics of its validation, and writes its weights
+# Takes the number of finished steps, the number of all steps, and the latest metrics as text
 Progress = Callable[[int, int, str], None]
-"""Takes the number of finished steps, the number of all steps, and the latest metrics as text."""
 
 _UNREADABLE = (OSError, EOFError, RuntimeError, KeyError, TypeError, ValueError, pickle.PickleError, zipfile.BadZipFile)
+# Optimisation settings that may change when a training resumes
 NOT_IDENTITY = ("steps", "validate_every", "init", "stored")
-"""Optimisation settings that may change when a training resumes.
 
-`init`, a target's name, is among them, because the hash of that target's weights counts instead.
-"""
-
-SAME_REQUEST = 2.0
-"""A second signal within this many seconds counts as the same request.
-
-A scheduler may pass on a Ctrl-C that the process has received already.
-"""
+SAME_REQUEST = 2.0  # a second signal within this many seconds counts as the same request
 
 
 def fit(
@@ -67,27 +59,7 @@ def fit(
     identity: str,
     progress: Progress = lambda done, total, text: None,
 ) -> Metrics:
-    """Train a network for `settings.steps` steps in all. If the folder holds a resume file, continue from there.
-
-    Args:
-        network: The network, on its device.
-        loss: Returns the loss of a step.
-        validate: Returns the metrics of the averaged weights. It is called every `settings.validate_every` steps.
-        save: Writes the averaged weights. It is called after each validation whose score is the best so far.
-        settings: Optimisation settings.
-        folder: Folder for the resume file and `log.csv`.
-        identity: Hash of the settings and data that determine the training. The resume file stores it.
-        progress: Called after each step and after each validation.
-
-    Returns:
-        The metrics of the best weights.
-
-    Raises:
-        CheckpointError: The resume file is damaged, or holds a training with enough steps but without a validation.
-        KervError: The training diverged.
-        StorageError: The disk cannot be written.
-        Interrupted: The process got Ctrl-C or SIGTERM. The current step was finished and the state is saved.
-    """
+    """Train a network for `settings.steps` steps in all. If the folder holds a resume file, continue from there."""
     network.train()
     state = State(network, settings, folder, identity)
     state.restore()
@@ -109,14 +81,7 @@ def fit(
 
 
 class State:
-    """The state of a training: network, a copy of it with averaged weights, optimiser, step and metrics.
-
-    Args:
-        network: The network to train.
-        settings: Optimisation settings.
-        folder: Folder for the resume file and `log.csv`.
-        identity: Hash of the settings and data that determine the training.
-    """
+    """The state of a training: network, a copy of it with averaged weights, optimiser, step and metrics."""
 
     def __init__(self, network: nn.Module, settings: TrainSettings, folder: Path, identity: str) -> None:
         self.network, self.settings, self.folder, self.identity = network, settings, folder, identity
@@ -129,11 +94,6 @@ class State:
         self.average = copy.deepcopy(network).eval()
 
     def update(self, loss: Loss) -> Metrics:
-        """Do one optimiser step on one batch, and return its loss and the other metrics to log.
-
-        Raises:
-            KervError: The loss or another metric is not finite.
-        """
         settings = self.settings
         for group in self.optimiser.param_groups:
             group["lr"] = settings.lr * schedule(self.step, settings)
@@ -152,17 +112,7 @@ class State:
         return metrics
 
     def validate(self, validate: Validate, save: Save, training_loss: float) -> None:
-        """Validate the averaged weights, save them if their score is the best so far, and write the resume file.
-
-        Args:
-            validate: Returns the metrics of the averaged weights.
-            save: Writes the averaged weights.
-            training_loss: Loss of the last step, to log beside the metrics.
-
-        Raises:
-            KervError: A metric is not finite.
-            StorageError: The disk cannot be written.
-        """
+        """Validate the averaged weights, save them if their score is the best so far, and write the resume file."""
         metrics = {"step": float(self.step), "train_loss": training_loss, **validate(self.average)}
         check_finite(metrics, self.step)
         self.history.append(metrics)
@@ -171,7 +121,6 @@ class State:
         self.store()
 
     def store(self) -> None:
-        """Write the resume file with the present state, then `log.csv`."""
         state = {
             "identity": self.identity,
             "step": self.step,
@@ -186,7 +135,6 @@ class State:
         self.log()
 
     def log(self) -> None:
-        """Write the metrics of all validations to `log.csv`. Before the first validation no file is written."""
         import pandas as pd
 
         if self.history:
@@ -197,9 +145,6 @@ class State:
         """Load weights, optimiser and progress from the folder's resume file, if there is one.
 
         If steps are left, a line on stderr names the step at which the training resumes.
-
-        Raises:
-            CheckpointError: The resume file is damaged.
         """
         path = self.folder / RESUME
         if not path.is_file():
@@ -215,17 +160,11 @@ class State:
 
 
 def text_of(metrics: Metrics) -> str:
-    """Return the first few metrics (at most six, without the step) as text for a progress bar."""
     first = list(metrics.items())[:6]
     return " ".join(f"{name} {value:.4g}" for name, value in first if name != "step")
 
 
 def check_finite(metrics: Metrics, step: int) -> None:
-    """Check that a training has not diverged.
-
-    Raises:
-        KervError: A metric is not finite.
-    """
     for name, value in metrics.items():
         if not math.isfinite(value):
             raise KervError(f"training diverged: {name} is {value} at step {step}: lower train.lr")
@@ -235,8 +174,6 @@ def batches(count: int, settings: TrainSettings, weights: Tensor | None = None) 
     """Return a function that draws the samples of a step's batch. Only `settings.seed` and the step determine them.
 
     Args:
-        count: Number of samples.
-        settings: Optimisation settings.
         weights: (count,) float64. Sample i is drawn in proportion to `weights[i]`. If None, all samples are
             equally likely.
 
@@ -287,9 +224,6 @@ def until_interrupted() -> Iterator[threading.Event]:
 
     A signal more than SAME_REQUEST seconds later raises KeyboardInterrupt. Signals that the process ignores stay
     ignored.
-
-    Yields:
-        The event. The first signal sets it.
     """
     stop = threading.Event()
     first = math.inf
@@ -316,28 +250,14 @@ def until_interrupted() -> Iterator[threading.Event]:
 
 
 def identity_of(train: TrainSettings, dataset: DemoDataset, **own: Any) -> str:
-    """Return a hash of the settings and data that determine the weights after a given number of steps.
-
-    Args:
-        train: Optimisation settings.
-        dataset: The demonstrations.
-        **own: Further values that determine the weights, such as the network's shapes.
-    """
+    """Return a hash of the settings and data that determine the weights after a given number of steps."""
     counted = {key: value for key, value in asdict(train).items() if key not in NOT_IDENTITY}
     counted["closed_loop"] = train.closed_loop > 0  # scores with and without success cannot be compared
     return hash_of({"train": counted, "demos": dataset.sha256, **own})
 
 
 def resumes(folder: Path, identity: str, setting: str, replace: bool, begun: bool) -> bool:
-    """Return whether the folder holds this training, to go on with. Refuse what else it holds, unless `replace`.
-
-    Args:
-        folder: The folder.
-        identity: Result of `identity_of`.
-        setting: The setting that names the folder, for the error message.
-        replace: Whether `replace=true` was typed.
-        begun: Whether the database says that the command which made the folder's content has not ended well.
-    """
+    """Return whether the folder holds this training, to go on with. Refuse what else it holds, unless `replace`."""
     try:
         stored = torch.load(folder / RESUME, "cpu", mmap=True, weights_only=True)["identity"]
     except FileNotFoundError:
@@ -353,11 +273,6 @@ def resumes(folder: Path, identity: str, setting: str, replace: bool, begun: boo
 
 
 def read_state(path: Path) -> dict[str, Any]:
-    """Return the state in a resume file: identity, step, history of metrics, weights, their average and optimiser.
-
-    Raises:
-        CheckpointError: The file is damaged.
-    """
     try:
         with zipfile.ZipFile(path) as archive:
             if archive.testzip() is not None:  # torch itself does not compare the checksums
@@ -371,7 +286,6 @@ def read_state(path: Path) -> dict[str, Any]:
 
 
 def figures_of(dataset: DemoDataset, network: Any, metrics: dict[str, float]) -> dict[str, Any]:
-    """Return facts about a training for the artifact's description: data, validation metrics, number of parameters."""
     return {
         "demos": {"sha256": dataset.sha256, "config": dataset.manifest.config},
         "validation": metrics,

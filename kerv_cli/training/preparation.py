@@ -41,18 +41,7 @@ class Step:
 
 
 def plan(settings: PrepareSettings, database: Database) -> list[Step]:
-    """Return all steps in order, including finished ones. No weights are loaded and nothing is made.
-
-    Args:
-        settings: Settings of `kerv prepare`.
-        database: The database of the results folder.
-
-    Raises:
-        UsageError: The target or a method does not exist, or the target does not decode autoregressively and so needs
-            no artifacts.
-        CheckpointError: The demonstrations do not exist. Or a folder for a new artifact holds an artifact of
-            another target.
-    """
+    """Return all steps in order, including finished ones. No weights are loaded and nothing is made."""
     artifacts = Artifacts(settings.results, settings.policy)
     description = artifacts.description
     description.check_autoregressive(f"policy.target={settings.policy.target}", "it needs nothing more")
@@ -76,14 +65,7 @@ def plan(settings: PrepareSettings, database: Database) -> list[Step]:
 
 @functools.cache
 def needs(methods: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the kinds of artifacts that the methods need, in the order in which they must be made.
-
-    Args:
-        methods: Names of methods. If empty, all methods that work with the target.
-
-    Raises:
-        UnknownName: A method does not exist.
-    """
+    """Return the kinds of artifacts that the methods need, in the order in which they must be made."""
     artifacts = ArtifactPart.every()
     kinds: set[str] = set()
     for name in methods or groups()["method"]:
@@ -96,7 +78,6 @@ def needs(methods: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _state(artifacts: Artifacts, database: Database, kind: str, kinds: Sequence[str], replace: bool) -> str:
-    """Return the state of an artifact, see `Step`. One of other artifacts is refused unless `replace`."""
     files, path = kind_of(kind), artifacts.path(kind)
     if not artifacts.exists(kind):
         return MISSING

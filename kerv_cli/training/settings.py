@@ -24,12 +24,11 @@ QUICK = "a first policy in minutes: adds the settings in conf/quick.yaml"
 FIRST_EPISODES = "episodes used per task, lowest seeds first; 0: all"
 
 
+# Takes the title of a stage of the work. Returns a context manager that yields a progress function (done, total).
 Stage = Callable[[str], AbstractContextManager[Callable[..., None]]]
-"""Takes the title of a stage of the work. Returns a context manager that yields a progress function (done, total)."""
 
 
 def quietly(title: str) -> AbstractContextManager[Callable[..., None]]:
-    """Show no progress of a stage."""
     return nullcontext(lambda *done: None)
 
 
@@ -58,11 +57,9 @@ class Plan(Generic[T]):
 
     @property
     def folder(self) -> Path:
-        """Folder whose name the database stores."""
         return self.path.parent if self.kind == "calibration" else self.path
 
     def make(self, stage: Stage = quietly) -> T:
-        """Make the artifact while no other command can."""
         with owned(self.path, self.check):
             return self.work(stage)
 
@@ -163,11 +160,6 @@ class TrainDrafterSettings(DemonstrationSettings):
     train: TrainSettings = setting(TrainSettings, "optimisation")
 
     def check_together(self, prefix: str) -> None:
-        """Refuse optimisation settings that only the training of a target reads.
-
-        Raises:
-            UsageError: Such a setting differs from its default.
-        """
         unused = ("init", "balance", "closed_loop", "colour", "places")
         refuse_unused(self.train, unused, ": only the training of a target has this setting")
 
@@ -239,29 +231,12 @@ class CalibrateSettings(DemonstrationSettings):
     complete: bool = setting(False, "keep every number of the existing calibration; add those that it lacks")
 
     def check_together(self, prefix: str) -> None:
-        """Refuse an empty `boundary_windows`.
-
-        Args:
-            prefix: Text before a setting's name in the error message.
-
-        Raises:
-            UsageError: `boundary_windows` is empty.
-        """
         if not self.boundary_windows:
             raise UsageError(f"{prefix}boundary_windows=[]: name at least one number of positions")
 
 
 def refuse_unused(train: TrainSettings, keys: Sequence[str], why: str) -> None:
-    """Refuse optimisation settings that the training would ignore.
-
-    Args:
-        train: The optimisation settings.
-        keys: Names of the settings that this training does not read.
-        why: End of the error message, after `train.KEY=VALUE`.
-
-    Raises:
-        UsageError: One of the settings in `keys` differs from its default.
-    """
+    """Refuse optimisation settings that the training would ignore."""
     for key in keys:
         if (value := getattr(train, key)) != getattr(TrainSettings(), key):
             raise UsageError(f"train.{key}={value}{why}")

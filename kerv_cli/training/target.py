@@ -46,17 +46,14 @@ from kerv_cli.worlds import resolve_tasks, settled, spec_of, specs
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.files import DemoEpisode
 
-STATE_EPISODES = 200
-"""Maximum number of episodes from which the range of the states is measured."""
+STATE_EPISODES = 200  # maximum number of episodes from which the range of the states is measured
+# Validation reports the share of tokens at most this many bins from the label. It is Spec-VLA's acceptance radius.
 WITHIN = 9
-"""Validation reports the share of tokens at most this many bins from the label. It is Spec-VLA's acceptance radius."""
+# Positions that a policy estimates if its demonstrations hold no object positions: where the hand will be when the
+# gripper next changes, and at the end of the episode. No state contains them, so their index 0 is never used.
 WAYPOINTS = (Place("waypoint 1", 0), Place("waypoint 2", 0))
-"""Positions that a policy estimates if its demonstrations hold no object positions: where the hand will be when the
-gripper next changes, and at the end of the episode. No state contains them, so their index 0 is never used."""
-FEW = 4
-"""Episodes on which `--plan` measures the time of a step."""
-VALIDATED = 2048
-"""Maximum number of samples in a validation."""
+FEW = 4  # episodes on which `--plan` measures the time of a step
+VALIDATED = 2048  # maximum number of samples in a validation
 
 
 def plan_target(settings: TrainTargetSettings, database: Database) -> Plan[tuple[Path, Metrics]]:
@@ -139,11 +136,6 @@ def plan_target(settings: TrainTargetSettings, database: Database) -> Plan[tuple
 
 
 def refuse_contradictions(settings: TrainTargetSettings) -> None:
-    """Check the number format and the image size of a training.
-
-    Raises:
-        UsageError: `runtime.dtype` is not float32, or the policy's image size differs from the camera's.
-    """
     shown, dtype = settings.world.camera.size, settings.runtime.dtype
     if dtype != "float32":
         raise UsageError(f"runtime.dtype={dtype}: a target is trained in float32; remove runtime.dtype")
@@ -155,20 +147,7 @@ def refuse_contradictions(settings: TrainTargetSettings) -> None:
 
 
 def settle_places(settings: TrainTargetSettings, dataset: DemoDataset) -> None:
-    """Choose the positions that the policy learns to estimate, and check that the demonstrations hold them.
-
-    A policy with `target.observation=state` reads object positions as input, so the demonstrations must hold them. A
-    policy with `target.observation=vision` learns to estimate positions. If the demonstrations hold no object
-    positions, this function changes `train.places` from `state` to `path`, and says so on stderr. The policy then
-    learns to estimate where the hand will be.
-
-    Raises:
-        UsageError: The policy reads object positions as input, and the demonstrations hold none. Or a setting needs
-            images, and the policy reads none. Or `train.places` is `path` and `train.scene_weight` is above 0, but a
-            policy moved the robot in some demonstrations. The hand's path is then not the expert's.
-        CheckpointError: The demonstrations hold neither object positions nor the hand's position, so the policy has no
-            positions to estimate.
-    """
+    """Choose the positions that the policy learns to estimate, and check that the demonstrations hold them."""
     train, manifest = settings.train, dataset.manifest
     where = f"the demonstrations in {dataset.path}"
     if settings.target.observation == "state":
@@ -192,18 +171,7 @@ def settle_places(settings: TrainTargetSettings, dataset: DemoDataset) -> None:
 
 
 def initial_target(settings: TrainTargetSettings, camera: str, new: Path) -> Path | None:
-    """Return the folder of the target whose weights training starts from. None if `train.init` is not set.
-
-    Args:
-        settings: Settings of the training.
-        camera: Name of the camera.
-        new: Folder of the new target.
-
-    Raises:
-        UsageError: The target `train.init` does not exist, or the training would overwrite it. Or it has another camera
-            or other shapes than the new one.
-        CheckpointError: The target `train.init` is damaged.
-    """
+    """Return the folder of the target whose weights training starts from. None if `train.init` is not set."""
     name = settings.train.init
     if name is None:
         return None
@@ -222,11 +190,7 @@ def load_training(
     camera: str,
     progress: OnProgress,
 ) -> tuple[CompactTarget, Samples]:
-    """Read the demonstrations into memory, and make the network. If `init` is not None, use the weights in that folder.
-
-    Raises:
-        CheckpointError: The demonstrations or the target `init` are damaged or of another environment.
-    """
+    """Read the demonstrations into memory, and make the network, with the weights in `init` if that is not None."""
     manifest, shapes, old = dataset.manifest, settings.target, None
     words, observation = vocabulary(manifest.environment), manifest.observation
     if init is not None:
@@ -277,20 +241,6 @@ def load_samples(
     progress: OnProgress = lambda done, total: None,
     waypoints: int = 0,
 ) -> Samples:
-    """Read the episodes of some tasks into memory.
-
-    Args:
-        dataset: The demonstrations.
-        settings: Shapes of the target.
-        words: Tokenizer of the instructions.
-        task_names: Full names of the tasks.
-        progress: Called with two numbers: episodes read, all episodes.
-        waypoints: Number of later positions of the hand that the policy learns to estimate. If 0, the policy learns
-            the positions of object and goal instead.
-
-    Raises:
-        CheckpointError: An episode has too few actions of the expert, or images of another size.
-    """
     chosen = dataset.of_tasks(*task_names)
     parts = []
     for number, index in enumerate(chosen):
@@ -321,11 +271,7 @@ def waypoints_of(episode: DemoEpisode, steps: np.ndarray, count: int, actions: A
     in which the expert's command of a strict DoF (the gripper) moves by more than an eighth of its range.
 
     Args:
-        episode: A demonstration.
         steps: (n,) control steps.
-        count: Number K of positions per step: those at the next K − 1 gripper changes and at the end. If fewer changes
-            follow, the position at the end fills the rest.
-        actions: The action space.
 
     Returns:
         (n, K, 3) float32, metres.
@@ -346,7 +292,6 @@ def task_weights(tasks: Tensor, balance: float) -> Tensor | None:
 
     Args:
         tasks: (n,) index of each sample's task.
-        balance: From 0 (all samples are equally likely) to 1 (all tasks are equally likely).
 
     Returns:
         (n,) float64 weights; None if all samples are equally likely.
@@ -367,8 +312,6 @@ def lit(images: Tensor, indices: Tensor, step: int, spread: float) -> Tensor:
     Args:
         images: (B, 3, h, w) uint8.
         indices: (B,) indices of the samples. With `step`, they determine the random fields.
-        step: The optimisation step.
-        spread: Largest standard deviation of the field.
 
     Returns:
         (B, 3, h, w) uint8.
@@ -383,15 +326,7 @@ def lit(images: Tensor, indices: Tensor, step: int, spread: float) -> Tensor:
 
 
 class Imitation:
-    """A target's samples, its loss and its validation.
-
-    Args:
-        target: The network to train, already on its device.
-        samples: All samples. Some whole episodes are held out for validation.
-        settings: Optimisation settings.
-        closed_loop: Function that runs simulated episodes with a target and returns the success in [0, 1]. The success
-            then dominates the score. None if success is not measured.
-    """
+    """A target's samples, its loss and its validation."""
 
     def __init__(
         self,
@@ -435,13 +370,8 @@ class Imitation:
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
         """Return the loss of a batch, and the metrics to log.
 
-        The loss is the token loss plus `train.scene_weight` times the position loss. The position loss measures
-        the errors of the positions, such as object and goal, that a target with cameras estimates. In the first
-        `train.scene_steps` steps the loss is the position loss alone. A target without cameras has only the token loss.
-
         Args:
             indices: (B,) indices of the samples.
-            step: The optimisation step.
         """
         batch = self.training.where(indices)
         inputs = batch.inputs(self.device)
@@ -510,15 +440,6 @@ def check_init(settings: TargetSettings, camera: str, description: TargetDescrip
 
     Only the settings `size`, `chunk`, `code`, `norm` and `parallel` may differ. The new target may see further camera
     views after the views of the old target.
-
-    Args:
-        settings: Shapes of the new target.
-        camera: Camera of the new target. Several views are joined by `+`.
-        description: Description of the target with the initial weights.
-        folder: Folder of the target with the initial weights, for the error message.
-
-    Raises:
-        UsageError: A shape or the camera differs. The message names the first difference.
     """
     for name, value in asdict(settings).items():
         stored = description.settings.get(name)
@@ -537,18 +458,7 @@ def check_init(settings: TargetSettings, camera: str, description: TargetDescrip
 def continued_target(
     settings: TargetSettings, init: CompactTarget, camera: str, code: FastCode | None = None
 ) -> CompactTarget:
-    """Make a target that starts from the weights, action statistics and vocabulary of another target.
-
-    Weights that only the new target has, such as the query embeddings of a parallel target, are newly initialised. If
-    the action tokens differ, the token embedding and the head are newly initialised, too. The encoder of an added view
-    is a copy of the first view's. The weights from an added view to the estimated object positions start at zero.
-
-    Args:
-        settings: Shapes of the new target.
-        init: The target with the initial weights.
-        camera: Camera of the new target. Several views are joined by `+`.
-        code: Code of the new target's FAST tokens. If None, each number of an action is one token.
-    """
+    """Make a target that starts from the weights, action statistics and vocabulary of another target."""
     actions = replace(init.actions, code=code)
     target = CompactTarget(replace(settings), actions, init.observation, init.words, camera)
     new, old = target.state_dict(), init.state_dict()
@@ -568,5 +478,4 @@ def continued_target(
 
 
 def vocabulary(environment: str) -> WordTokenizer:
-    """Return a word tokenizer whose vocabulary is all words in the instructions of an environment's tasks."""
     return WordTokenizer.build(t.instruction for t in specs()[environment].tasks.values())
