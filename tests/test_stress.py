@@ -33,12 +33,12 @@ from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
 from kerv_cli.worlds.mujoco_world import MujocoWorld
 from kerv_cli.worlds.settings import CameraSettings, StressSettings
-from kerv_cli.worlds.stress import CameraJitter, Objects, Sensor, objects, scenery_of
+from kerv_cli.worlds.stress import Sensor
 from kerv_cli.worlds.vectors import length
 
 SEED, STEPS, SIZE = 50_006, 24, 48
-KINDS = ("push", "actuation", "sensor", "light", "colour", "camera", "object")
-SEEN = ("sensor", "light", "colour", "camera")  # kinds that change what the policy sees, and no state
+KINDS = ("push", "sensor", "light")
+SEEN = ("sensor", "light")  # kinds that change what the policy sees, and no state
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def test_a_kind_changes_what_it_should_as_the_seed_says_and_level_0_nothing(kind
     assert (plain.states.tobytes() == stressed.states.tobytes()) == (kind in SEEN)
     assert plain.images.tobytes() != stressed.images.tobytes()
     assert (plain.frames.tobytes() == stressed.frames.tobytes()) == (kind == "sensor")
-    assert (plain.start.tobytes() == stressed.start.tobytes()) == (kind != "object")
+    assert plain.start.tobytes() == stressed.start.tobytes()
 
 
 @pytest.mark.bits
@@ -108,24 +108,12 @@ def test_the_model_is_whole_again_at_the_next_episode(name, request):
     world = request.getfixturevalue(name)
     play(world, "none", 0, steps=1)
     before = model_of(world)
-    for kind in ("light", "colour", "camera", "object"):
-        play(world, kind, 4, steps=1)
-        during = model_of(world)
-        assert any(during[key].tobytes() != before[key].tobytes() for key in before), kind
-        play(world, "none", 0, steps=1)
-        after = model_of(world)
-        assert [key for key in before if after[key].tobytes() != before[key].tobytes()] == []
-
-
-def test_cameras_are_moved_and_turned_by_the_levels_numbers(insertion):
-    play(insertion, "none", 0, steps=1)
-    plain = model_of(insertion)
-    for level, (metres, degrees) in enumerate(CameraJitter.levels, 1):
-        play(insertion, "camera", level, steps=1)
-        moved = model_of(insertion)
-        assert np.allclose(np.linalg.norm(moved["cam_pos"] - plain["cam_pos"], axis=1), metres)
-        half = np.abs((moved["cam_quat"] * plain["cam_quat"]).sum(axis=1)).clip(max=1.0)
-        assert np.allclose(np.rad2deg(2 * np.arccos(half)), degrees, atol=1e-5)
+    play(world, "light", 4, steps=1)
+    during = model_of(world)
+    assert any(during[key].tobytes() != before[key].tobytes() for key in before)
+    play(world, "none", 0, steps=1)
+    after = model_of(world)
+    assert [key for key in before if after[key].tobytes() != before[key].tobytes()] == []
 
 
 def test_a_push_drives_the_hand_off_for_a_tenth_of_a_second_in_one_direction():
@@ -165,59 +153,16 @@ def test_a_dropped_picture_is_the_one_observed_before(monkeypatch):
     assert stress.see("topview", np.full((4, 4, 3), 200, np.uint8), 4).mean() > 190  # another camera's first
 
 
-def test_the_object_is_what_the_robot_is_not(metaworld):
-    metaworld.stress = stressing.build(StressSettings())
-    metaworld.reset(SEED)
-    model = metaworld._drawable()[0]
-    assert [model.body(body).name for body in objects(model)] == ["obj"]
-    painted = {model.body(model.geom_bodyid[geom]).name for geom in scenery_of(model)}
-    assert {"world", "tablelink", "RetainingWall"} <= painted
-    assert not painted & {"obj", "hand", "right_arm_base_link", "mocap"}
-
-
-def test_an_object_has_another_size_mass_and_friction(metaworld):
-    play(metaworld, "none", 0, steps=1)
-    before, model = model_of(metaworld), metaworld._drawable()[0]
-    body = objects(model)[0]
-    geom = int(np.flatnonzero(model.geom_bodyid == body)[0])
-    play(metaworld, "object", 3, steps=1)
-    after = model_of(metaworld)
-    size = after["geom_size"][geom, 0] / before["geom_size"][geom, 0]
-    mass = after["body_mass"][body] / before["body_mass"][body]
-    friction = after["geom_friction"] / before["geom_friction"]
-    sizes, masses, frictions, _ = Objects.levels[2]
-    assert np.isclose(max(size, 1 / size), sizes)
-    assert np.isclose(max(mass, 1 / mass), masses)
-    assert np.isclose(np.maximum(friction, 1 / friction), frictions).all()
-    grown = after["body_mass"][body] - before["body_mass"][body]
-    assert np.isclose(after["body_subtreemass"][0] - before["body_subtreemass"][0], grown)
-
-
-def test_initial_ranges_are_widened_around_their_centre_and_heights_stay(metaworld):
-    inside = play(metaworld, "none", 0, steps=1).start
-    outside = play(metaworld, "object", 1, steps=1).start
-    space = metaworld._env._random_reset_space
-    centre = (space.low + space.high) / 2
-    flat = np.array([True, True, False, True, True, False])
-    assert np.allclose((outside - centre)[flat], Objects.levels[0][3] * (inside - centre)[flat])
-    assert (outside[~flat] == inside[~flat]).all()
-    starts = [play(metaworld, "object", 4, seed, 1).start for seed in range(50_000, 50_020)]
-    left = [not space.contains(np.asarray(start, dtype=space.dtype)) for start in starts]
-    assert any(left)
-    # a placement that the task refuses is drawn nearer, not forever
-    assert all(np.linalg.norm(start[:2] - start[3:5]) >= 0.15 for start in starts)
-
-
 @pytest.mark.bits
 def test_worlds_are_shared_between_stressed_and_plain_settings():
-    stressed = settings("record=0", "world.stress.kind=object", "world.stress.level=4")
+    stressed = settings("record=0", "world.stress.kind=push", "world.stress.level=4")
     plain = Runner(settings("record=0"), "insert-peg")
     try:
         first, shifted, again = (r.episode(SEED) for r in (plain, Runner(stressed, "insert-peg"), plain))
     finally:
         close_worlds()
     assert first.actions.tobytes() == again.actions.tobytes()
-    assert first.initial_state.tobytes() != shifted.initial_state.tobytes()
+    assert first.path.tobytes() != shifted.path.tobytes()
 
 
 def settings(*words: str) -> RolloutSettings:
@@ -238,18 +183,18 @@ def test_what_an_environment_cannot_do_and_unknown_kinds_are_refused():
     recorded = register_recorded("tape", INSERTION.actions, INSERTION.observation, {"wipe": "wipe the table"}, "front")
     no_position = dataclasses.replace(INSERTION, actions=dataclasses.replace(INSERTION.actions, groups=renamed))
     for kind, spec, why in (
-        ("camera", POINT, "MuJoCo model"),
+        ("light", POINT, "MuJoCo model"),
         ("push", recorded, "is a recording"),
         ("push", no_position, "no group 'position'"),
     ):
         with pytest.raises(UsageError, match=why):
             spec.check_stress(StressSettings(kind, 1))
-    for kind in ("push", "actuation", "sensor"):
+    for kind in ("push", "sensor"):
         POINT.check_stress(StressSettings(kind, 1))
     for kind in KINDS:
         METAWORLD.check_stress(StressSettings(kind, 4))
         recorded.check_stress(StressSettings(kind, 0))
-    check(settings("world.stress.kind=object", "world.stress.level=4"))
+    check(settings("world.stress.kind=light", "world.stress.level=4"))
     with pytest.raises(UsageError):
         settings("world.stress.level=1")
     with pytest.raises(UnknownName):

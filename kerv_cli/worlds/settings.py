@@ -41,7 +41,7 @@ class StressSettings:
     The disturbance of an episode is drawn from task, seed, kind and level.
     """
 
-    kind: str = setting("none", "what is disturbed: push, actuation, sensor, light, colour, camera or object")
+    kind: str = setting("none", "what is disturbed: push, light or sensor")
     level: int = number(0, 0, MOST_STRESS, help="strength of the disturbance; 0: none")
 
     @property

@@ -30,7 +30,6 @@ Expert: TypeAlias = Callable[[Observation], NDArray[np.float64]]
 _LACKS = {
     "position": "its actions have no group 'position'",
     "model": "its world has no MuJoCo model",
-    "range": "its world cannot widen the range of initial states",
 }
 """Error messages for environments that lack what a kind of stress needs, by the entry of `StressPart.requires`."""
 
@@ -296,8 +295,7 @@ class World(ABC):
         success: Success flag of the latest step. A later step may unset it.
         succeeded: Whether `success` was set at any step of this episode.
         stress: Disturbance of the episodes (docs/stress.md). A new value takes effect at the next reset.
-        stressable: What a stress can change in this world: `actions`, `images`, `model` (the MuJoCo model) and `range`.
-            A subclass adds `range` if its `_start` widens the range of initial states by the factor `stress.spread`.
+        stressable: What a stress can change in this world: `actions`, `images` and `model` (the MuJoCo model).
     """
 
     stressable: ClassVar[frozenset[str]] = frozenset({"actions", "images"})

@@ -1,6 +1,6 @@
 """Stress: disturbances of known size, so that the evaluated world differs from the training world (docs/stress.md).
 
-Kinds of stress change the model (light, colour, camera, objects), actions (push, actuation) or images (sensor).
+Kinds of stress change the model (light), actions (push) or images (sensor).
 """
 
 from __future__ import annotations
@@ -59,12 +59,10 @@ class Stress:
         levels: Size of the disturbance at level 1, 2, ….
         level: Chosen level. 0 means no disturbance.
         amount: The entry of `levels` for the chosen level. None at level 0.
-        spread: Factor by which the range of initial states is widened around its centre. 1 changes nothing.
     """
 
     kind: ClassVar[str] = "none"
     levels: ClassVar[tuple[Any, ...]] = ()
-    spread = 1.0
 
     def __init__(self, level: int = 0) -> None:
         self.level = level
@@ -132,26 +130,6 @@ def build(settings: StressSettings) -> Stress:
     return StressPart.find(settings.kind).built(settings.level)
 
 
-def factor_or_inverse(random: np.random.Generator, factor: float) -> float:
-    """Return `factor` or 1 / `factor`, each with probability 1/2."""
-    return factor if random.random() < 0.5 else 1.0 / factor
-
-
-def robot_roots(model: Model) -> Iterator[int]:
-    """Yield the ids of the robots' root bodies: roots for which an actuator moves the root or a body below it."""
-    import mujoco
-
-    joints = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-    for kind, (target, _) in zip(model.actuator_trntype, model.actuator_trnid, strict=True):
-        body = model.jnt_bodyid[target] if kind in joints else model.site_bodyid[target]
-        yield int(model.body_rootid[body])
-
-
-WIDE = 0.35
-"""A fixed geom (shape) is scenery if it is a plane, or if its bounding sphere has at least this radius in metres."""
-_FROM_MATERIAL = 0.5, 0.5, 0.5, 1.0  # rgba of a geom that takes its colour from its material
-
-
 @StressPart("light", requires=("model",))
 class Light(Stress):
     """All lights are brighter or darker, and lamps (lights with a position in the scene) shine from other directions.
@@ -172,7 +150,7 @@ class Light(Stress):
         lights = (model.light_ambient, model.light_diffuse, model.light_specular)
         strengths = (*lights, head.ambient, head.diffuse, head.specular)
         changes.keep(*strengths, model.light_dir, model.light_pos)
-        gain = factor_or_inverse(random, gain)
+        gain = gain if random.random() < 0.5 else 1.0 / gain
         for strength in strengths:
             strength[...] *= gain
         for lamp in range(model.nlight):
@@ -181,155 +159,13 @@ class Light(Stress):
                 vector[:] = sum((turn * vector).T)  # not `turn @ vector`: OpenBLAS rounds differently on different CPUs
 
 
-@StressPart("colour", requires=("model",))
-class Colour(Stress):
-    """Floor, walls and table get random colours, one per body. Sky, robot and objects keep their colours.
-
-    The new colour is a mixture of the old colour and a random colour. Each level is the share of the random colour. A
-    texture is multiplied by the new colour.
-    """
-
-    kind = "colour"
-    levels = (0.1, 0.2, 0.3, 0.45)
-
-    def change(self, model: Model, changes: ModelChanges) -> None:
-        """Mix the colours of floor, walls and table with random colours."""
-        share, random = self.amount, self.generator()
-        changes.keep(model.geom_rgba)
-        scenery = scenery_of(model)
-        bodies = np.unique(model.geom_bodyid[scenery]).tolist()
-        colours = dict(zip(bodies, random.random((len(bodies), 3)), strict=True))
-        for geom in scenery:
-            material = model.geom_matid[geom]
-            from_material = material >= 0 and np.allclose(model.geom_rgba[geom], _FROM_MATERIAL)
-            rgba = (model.mat_rgba[material] if from_material else model.geom_rgba[geom]).copy()
-            rgba[:3] = (1 - share) * rgba[:3] + share * colours[int(model.geom_bodyid[geom])]
-            model.geom_rgba[geom] = rgba
-
-
-@StressPart("camera", requires=("model",))
-class CameraJitter(Stress):
-    """Every camera of the model is slightly moved and turned.
-
-    Each level is (metres, degrees): distance in a random direction, and angle about a random axis.
-    """
-
-    kind = "camera"
-    levels = ((0.006, 0.6), (0.01, 1.0), (0.015, 1.5), (0.022, 2.2))
-
-    def change(self, model: Model, changes: ModelChanges) -> None:
-        """Move and turn every camera."""
-        metres, degrees = self.amount
-        random = self.generator()
-        changes.keep(model.cam_pos, model.cam_quat)
-        from scipy.spatial.transform import Rotation
-
-        for camera in range(model.ncam):
-            model.cam_pos[camera] += unit_vector(random, 3) * metres
-            turn = _random_turn(random, degrees)  # relative to the camera's own axes
-            turned = Rotation.from_quat(model.cam_quat[camera], scalar_first=True) * turn
-            model.cam_quat[camera] = turned.as_quat(scalar_first=True)
-
-
 def _random_turn(random: np.random.Generator, degrees: float) -> Rotation:
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_rotvec(unit_vector(random, 3) * np.deg2rad(degrees))
 
 
-def scenery_of(model: Model) -> list[int]:
-    """Return the ids of the geoms (shapes) of the scenery: background and table."""
-    import mujoco
-
-    large = (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) | (model.geom_rbound >= WIDE)
-    fixed = (model.body_weldid == 0) & (model.body_mocapid < 0) & ~np.isin(model.body_rootid, list(robot_roots(model)))
-    return np.flatnonzero(large & fixed[model.geom_bodyid]).tolist()
-
-
-@StressPart("object", requires=("model", "range"))
-class Objects(Stress):
-    """Objects have another size, mass and friction, and start in a wider range.
-
-    Objects are the bodies with their own joints that do not belong to a robot. The size changes only for objects that
-    move freely and have no mesh. The friction of all geoms changes, not only of the objects' geoms, because a
-    contact uses the larger friction of the two geoms. The damping of the objects' joints changes, too.
-
-    Each level is (size, mass, friction, spread). The first three are factors. In each episode, one random draw per
-    factor decides whether the values of all objects are multiplied by the factor or divided by it. `spread` is the
-    factor by which the range of initial states gets wider around its centre.
-    """
-
-    kind = "object"
-    levels = ((1.1, 1.6, 1.5, 1.2), (1.2, 2.5, 2.0, 1.4), (1.3, 4.0, 3.0, 1.7), (1.5, 6.0, 4.0, 2.3))
-
-    def __init__(self, level: int) -> None:
-        super().__init__(level)
-        self.spread = self.amount[3]
-
-    def change(self, model: Model, changes: ModelChanges) -> None:
-        """Scale the objects' size, mass and friction."""
-        random = self.generator()
-        size, mass, friction = (factor_or_inverse(random, factor) for factor in self.amount[:3])
-        changes.keep(model.geom_friction, model.dof_damping, model.dof_frictionloss, model.dof_invweight0)
-        changes.keep(model.body_mass, model.body_inertia, model.body_subtreemass, model.body_invweight0)
-        changes.keep(model.body_pos, model.body_ipos, model.bvh_aabb, model.site_pos)
-        changes.keep(model.geom_size, model.geom_pos, model.geom_aabb, model.geom_rbound)
-        model.geom_friction[:] *= friction
-        for body in objects(model):
-            dofs = slice(model.body_dofadr[body], model.body_dofadr[body] + model.body_dofnum[body])
-            model.dof_damping[dofs] *= friction
-            model.dof_frictionloss[dofs] *= friction
-            growth = size if _is_free_and_primitive(model, body) else 1.0
-            for part in np.flatnonzero(model.body_weldid == body).tolist():
-                _scale(model, part, growth, moved=part != body)
-                # and what MuJoCo derives from the mass
-                model.body_mass[part] *= mass
-                model.body_inertia[part] *= mass * growth**2
-                model.body_invweight0[part] /= mass
-                dofs = slice(model.body_dofadr[part], model.body_dofadr[part] + model.body_dofnum[part])
-                model.dof_invweight0[dofs] /= mass
-        model.body_subtreemass[:] = model.body_mass
-        for body in range(model.nbody - 1, 0, -1):
-            model.body_subtreemass[model.body_parentid[body]] += model.body_subtreemass[body]
-
-
-def objects(model: Model) -> list[int]:
-    """Return the ids of the bodies that have their own joints and do not belong to a robot."""
-    is_object = (model.body_dofnum > 0) & ~np.isin(model.body_rootid, list(robot_roots(model)))
-    return np.flatnonzero(is_object).tolist()
-
-
-def _is_free_and_primitive(model: Model, body: int) -> bool:
-    """Return whether an object moves freely and has no mesh."""
-    import mujoco
-
-    free = model.jnt_type[model.body_jntadr[body]] == mujoco.mjtJoint.mjJNT_FREE
-    parts = np.flatnonzero(model.body_weldid == body)
-    types = model.geom_type[np.isin(model.geom_bodyid, parts)]
-    return bool(free and not np.isin(types, (mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD)).any())
-
-
-def _scale(model: Model, body: int, factor: float, moved: bool) -> None:
-    """Scale the geoms and sites of a body around its origin.
-
-    Args:
-        model: The model.
-        body: Id of the body.
-        factor: Factor of the size.
-        moved: Whether to scale the body's position, too. True for a part that is fixed to an object.
-    """
-    if moved:
-        model.body_pos[body] *= factor
-    model.body_ipos[body] *= factor
-    geoms, sites = model.geom_bodyid == body, model.site_bodyid == body
-    for values in (model.geom_size, model.geom_pos, model.geom_aabb, model.geom_rbound):
-        values[geoms] *= factor
-    model.site_pos[sites] *= factor
-    model.bvh_aabb[model.body_bvhadr[body] : model.body_bvhadr[body] + model.body_bvhnum[body]] *= factor
-
-
 PUSH_SECONDS = 0.1
-STUCK_SECONDS = 0.25
 
 
 def bursts(
@@ -381,47 +217,6 @@ class Push(Stress):
             return action
         executed = action.copy()
         executed[self._position] = self._push
-        return executed
-
-
-@StressPart("actuation", requires=("actions",))
-class Actuation(Stress):
-    """Noise, wrong gains, and bursts in which one DoF is stuck.
-
-    Strict DoFs (those that must equal the target's token, such as a gripper) are not changed. Each level is (noise,
-    gain, stuck):
-
-    - noise: standard deviation of Gaussian noise, where 1 is half of a DoF's range
-    - gain: largest relative error of a DoF's gain, drawn once per episode
-    - stuck: mean number of bursts that begin per second while no burst is running. In a burst one DoF does not move.
-    """
-
-    kind = "actuation"
-    levels = ((0.3, 0.2, 0.5), (0.6, 0.4, 1.0), (0.9, 0.6, 1.5), (1.8, 0.8, 4.0))
-
-    def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """Draw the gains of the DoFs for an episode."""
-        super().begin(task, seed, space)
-        self._random = self.generator()
-        self._noise, gain, stuck = self.amount
-        self._loose = ~space.is_strict
-        self._low, self._high = np.array(space.low)[self._loose], np.array(space.high)[self._loose]
-        self._half, self._middle = space.half[self._loose], space.middle[self._loose]
-        self._gain = 1.0 + self._random.uniform(-gain, gain, len(self._half))
-        self._bursts = bursts(self._random, stuck, STUCK_SECONDS, space.control_hz)
-        self._stuck = 0
-
-    def act(self, action: Array, step: int) -> Array:
-        """Apply gains and noise to the action. A stuck DoF does not move."""
-        noise = self._random.normal(0.0, self._noise, len(self._half)) * self._half
-        runs, begins = next(self._bursts)
-        if begins:
-            self._stuck = int(self._random.integers(len(self._half)))
-        moved = self._middle + (action[self._loose] - self._middle) * self._gain + noise
-        if runs:
-            moved[self._stuck] = self._middle[self._stuck]
-        executed = action.copy()
-        executed[self._loose] = np.clip(moved, self._low, self._high)
         return executed
 
 

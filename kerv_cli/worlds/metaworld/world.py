@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import copy
 import functools
-import itertools
 import pickle
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -51,8 +50,6 @@ def _quiet_simulator() -> Iterator[None]:
 class MetaWorld(MujocoWorld):
     """A Meta-World task. Seed s is initial state number `s % 50` of `MT1(task, seed=s // 50)`."""
 
-    stressable = MujocoWorld.stressable | {"range"}
-
     _env: Any = None
 
     @property
@@ -71,38 +68,8 @@ class MetaWorld(MujocoWorld):
         if self._env is None:
             self._env = pickle.loads(placement.data)["env_cls"]()
         self._env.set_task(placement)
-        with contextlib.nullcontext() if self.stress.spread == 1.0 else self._wider_placement():
-            state, _ = self._env.reset()
+        state, _ = self._env.reset()
         return np.array(state, dtype=np.float64)
-
-    @contextlib.contextmanager
-    def _wider_placement(self) -> Iterator[None]:
-        """Make resets move object and goal away from the centre of their range, by the factor `stress.spread`.
-
-        They move horizontally. The task can refuse a placement, for example an object too close to its goal. Then the
-        distance is halved until the task accepts.
-        """
-        env = self._env
-        inside, space = env._last_rand_vec, env._random_reset_space
-        outwards = (self.stress.spread - 1.0) * (inside - (space.low + space.high) / 2)
-        outwards[2::3] = 0.0  # heights
-        reset_model = env.reset_model
-
-        def reset_outside() -> Any:  # a reset calls this twice; it asks for placements until it accepts one
-            shares = (0.5**tries for tries in itertools.count())
-
-            def placement() -> NDArray[np.float64]:
-                env._last_rand_vec = inside + outwards * next(shares)
-                return np.array(env._last_rand_vec)
-
-            env._get_state_rand_vec = placement
-            return reset_model()
-
-        env.reset_model = reset_outside
-        try:
-            yield
-        finally:
-            del env.reset_model, env._get_state_rand_vec
 
     def _advance(self, action: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
         state, _, _, _, info = self._env.step(action)

@@ -34,8 +34,6 @@ _FINGER = 0.023, 0.012  # metres: the fingers' distance from the middle when clo
 class InsertionWorld(MujocoWorld):
     """Task `insert-peg`: the peg is in the hand, the slot is tilted. `fetch-peg`: the peg stands on the table."""
 
-    stressable = MujocoWorld.stressable | {"range"}
-
     def __init__(
         self, spec: EnvironmentSpec, task: str, camera: CameraSettings | None = None, horizon: int = 0
     ) -> None:
@@ -57,7 +55,7 @@ class InsertionWorld(MujocoWorld):
             self._model = mujoco.MjModel.from_xml_path(str(Path(__file__).with_name("model.xml")))
             self._data = mujoco.MjData(self._model)
         mujoco.mj_resetData(self._model, self._data)
-        slot, peg, hand = place(self.task, np.random.default_rng([seed, *self.task.encode()]), self.stress.spread)
+        slot, peg, hand = place(self.task, np.random.default_rng([seed, *self.task.encode()]))
         self._placement = np.concatenate([slot.position, slot.vector, peg.position, peg.vector, hand.position])
         self._data.mocap_pos[0], self._data.mocap_quat[0] = slot.position, slot.quaternion
         self._data.qpos[:] = np.concatenate([hand.position, hand.quaternion, peg.position, peg.quaternion])
@@ -137,20 +135,19 @@ class InsertionWorld(MujocoWorld):
         self._model = self._data = None
 
 
-def place(task: str, random: np.random.Generator, spread: float = 1.0) -> tuple[Pose, Pose, Pose]:
+def place(task: str, random: np.random.Generator) -> tuple[Pose, Pose, Pose]:
     """Poses of slot, peg and hand at the start of an episode. The slot is always turned, too far for an unturned
-    peg. spread: factor of the ranges of their horizontal positions; of `fetch-peg` in y only, so that peg and slot
-    stay apart."""
+    peg."""
     yaw = random.choice([-1.0, 1.0]) * random.uniform(0.35, 1.0)
     if task == "insert-peg":
         tilt = quaternion_of(np.array([*random.uniform(-0.2, 0.2, 2), 0.0]))
         turn = quaternion_of(np.array([0.0, 0.0, yaw]))
-        slot = Pose(np.array([*spread * random.uniform(-0.09, 0.09, 2), 0.08]), product(tilt, turn))
-        hand = Pose.of(np.array([*spread * random.uniform(-0.06, 0.06, 2), random.uniform(0.24, 0.28)]), np.zeros(3))
+        slot = Pose(np.array([*random.uniform(-0.09, 0.09, 2), 0.08]), product(tilt, turn))
+        hand = Pose.of(np.array([*random.uniform(-0.06, 0.06, 2), random.uniform(0.24, 0.28)]), np.zeros(3))
         return slot, hand.along(-GRASP), hand
-    place_of_slot = np.array([random.uniform(0.05, 0.11), spread * random.uniform(-0.08, 0.08), 0.07])
+    place_of_slot = np.array([random.uniform(0.05, 0.11), random.uniform(-0.08, 0.08), 0.07])
     slot = Pose.of(place_of_slot, np.array([0.0, 0.0, yaw]))
     turned = np.array([0.0, 0.0, random.uniform(-0.8, 0.8)])
-    place_of_peg = np.array([random.uniform(-0.11, -0.05), spread * random.uniform(-0.08, 0.08), PEG_HALF])
+    place_of_peg = np.array([random.uniform(-0.11, -0.05), random.uniform(-0.08, 0.08), PEG_HALF])
     peg = Pose.of(place_of_peg, turned)
     return slot, peg, Pose.of(np.array([*random.uniform(-0.03, 0.03, 2), 0.2]), np.zeros(3))
