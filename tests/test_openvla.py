@@ -6,7 +6,6 @@ import json
 import math
 import re
 import shutil
-import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -20,6 +19,7 @@ from examples.tiny_openvla import ROBOT, TINY, write_checkpoint
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from loaded import of_target
+from openvla_reference import Reference
 from PIL import Image
 from safetensors.torch import load_file, save_file
 from scipy.ndimage import map_coordinates
@@ -35,7 +35,6 @@ from kerv_cli.targets.checkpoint import load_target, read_target
 from kerv_cli.targets.openvla.config import TOWERS, Bounds, Language, Shape, action_space, read_shape
 from kerv_cli.targets.openvla.inputs import as_in_libero, cropped, pixels_of
 from kerv_cli.targets.openvla.loading import is_unread, layout
-from kerv_cli.targets.openvla.reference import SAMPLES, Reference, parity
 from kerv_cli.targets.openvla.target import OpenVLATarget, import_checkpoint
 from kerv_cli.targets.settings import BuildTargetSettings
 
@@ -158,36 +157,6 @@ def test_logits_and_actions_equal_transformers(checkpoint, target, tmp_path, key
         assert [TINY.vocabulary - 1 - token for token in record.tokens] == generated
         np.testing.assert_allclose(record.actions[0], published_action(generated, TINY.vocabulary), atol=1e-6)
     assert worst < 1e-4
-
-
-def test_an_import_is_compared_with_transformers_on_request(checkpoint, tmp_path):
-    words = ("build", "target", f"checkpoint={checkpoint}", "prompt_tokens=120", f"results={tmp_path}", "--json")
-    figures = json.loads(kerv(*words, "check=true").stdout)
-    assert figures["tokens compared with transformers"] == 7 * len(SAMPLES)
-    assert figures["tokens that differ"] == 0
-    assert figures["largest difference of logits"] < 1e-4
-    half = json.loads(kerv(*words, "check=true", "runtime.dtype=bfloat16").stdout)
-    assert half["tokens that differ"] <= figures["tokens compared with transformers"] // 4
-    assert half["largest difference of logits"] > figures["largest difference of logits"]
-    assert "tokens that differ" not in json.loads(kerv(*words).stdout)
-
-
-def test_the_comparison_finds_a_forward_that_is_wrong(target, monkeypatch):
-    right = parity(target)
-    encode = target.encode
-    monkeypatch.setattr(target, "encode", lambda observation: encode(observation).flip(1))
-    wrong = parity(target)
-    assert (right["tokens that differ"], right["largest difference of logits"] < 1e-4) == (0, True)
-    assert wrong["tokens that differ"] > 0
-    assert wrong["largest difference of logits"] > 0.01
-
-
-def test_a_comparison_without_transformers_says_what_to_install(checkpoint, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "transformers", None)
-    words = (f"checkpoint={checkpoint}", "prompt_tokens=120", f"results={tmp_path}", "check=true")
-    assert "pip install 'transformers" in refusal("build", "target", *words, code=2)
-    assert not (tmp_path / "artifacts/target/openvla/target.json").exists()
-    assert "check=true" in refusal("build", "target", "grow=60m", f"results={tmp_path}", "check=true", code=2)
 
 
 @given(value=st.floats(-1.2, 1.2) | st.sampled_from([-1.0, 1.0]))
@@ -501,4 +470,5 @@ def test_a_drafter_that_does_not_fit_is_refused_in_one_line(results, drafter, tm
     if harm:
         harm(folder)
     words = words if "checkpoint=" in words else [f"checkpoint={folder}", *words]
-    assert said in refusal("build", "drafter", *words, "policy.target=openvla", f"results={results}")
+    named = ["policy.target=openvla", "policy.artifacts.drafter=other", f"results={results}"]
+    assert said in refusal("build", "drafter", *words, *named)

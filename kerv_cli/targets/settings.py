@@ -85,17 +85,4 @@ class BuildTargetSettings(RunSettings):
         False, "first compress the image as JPEG and resize it by Lanczos, as OpenVLA's evaluation on LIBERO does"
     )
     int8: bool = setting(False, "store the language model's layers with one byte per weight")
-    check: bool = setting(False, "compare tokens and logits with the transformers package; loads the weights twice")
     prompt_tokens: int = number(64, 1, 65_536, help="longest prompt in tokens, without the vision tokens")
-
-    def check_together(self, prefix: str) -> None:
-        """Check settings that depend on each other.
-
-        Args:
-            prefix: Start of the settings' names in error messages.
-
-        Raises:
-            UsageError: `check` is set, but the target is not made from an OpenVLA checkpoint.
-        """
-        if self.check and (self.family != "openvla" or self.grow.width):
-            raise UsageError(f"{prefix}check=true compares checkpoints of OpenVLA: name one with checkpoint=DIR")

@@ -24,16 +24,14 @@ from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import write_json
 from kerv_cli.base.manifests import read
 from kerv_cli.base.paths import artifact
-from kerv_cli.base.runtime import DTYPES, set_up
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.engine.draft import upload
 from kerv_cli.engine.protocol import Seen
 from kerv_cli.targets.attention import Cache
-from kerv_cli.targets.checkpoint import FORMAT, TargetDescription, load_target, target_fields
+from kerv_cli.targets.checkpoint import FORMAT, TargetDescription, target_fields
 from kerv_cli.targets.openvla.config import action_space, read_shape, read_statistics
 from kerv_cli.targets.openvla.inputs import Prompter, pixels_of, read_normalisations
 from kerv_cli.targets.openvla.loading import check_finite, digest_of, load_model, open_checked, open_shards
-from kerv_cli.targets.openvla.reference import check_installed, parity
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.targets.settings import BuildTargetSettings
 from kerv_cli.worlds import EnvironmentPart
@@ -205,8 +203,6 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
     """
     if not settings.checkpoint:
         raise UsageError("checkpoint=DIR: name the folder of a Hugging Face OpenVLA checkpoint")
-    if settings.check:
-        check_installed()
     source = Path(settings.checkpoint).expanduser().resolve()
     shape = read_shape(source)
     spec = None if settings.environment is None else EnvironmentPart.find(settings.environment).built()
@@ -235,8 +231,4 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
     described = {"format": FORMAT, "kind": "target", "sha256": digest_of(hashes, chosen), **fields}
     write_json(folder / "target.json", described)
     sizes = {"prompt tokens": shape.patches + len(prompt), "action tokens": actions.tokens, "DoFs": actions.dofs}
-    compared = {}
-    if settings.check:
-        device, _ = set_up(settings.runtime)
-        compared = parity(load_target(folder, device, DTYPES[settings.runtime.dtype])[0])
-    return folder, {"parameters": parameters, **sizes, **compared}
+    return folder, {"parameters": parameters, **sizes}
