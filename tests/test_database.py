@@ -28,7 +28,7 @@ from kerv_cli.base.errors import CheckpointError, StorageError, UsageError
 from kerv_cli.catalogue.imports import import_databases
 from kerv_cli.episodes.rows import decodes_table, episode_row
 from kerv_cli.lab import database as module
-from kerv_cli.lab.command import STORE, noted
+from kerv_cli.lab.command import STORE, noted, without_passwords
 from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, FILE, RUNS, STUDIES, WANTED, Database, Unanswered, opened
 from kerv_cli.lab.runs import Run, making, pulse, run_rows, time_left
 from kerv_cli.lab.store import Study, studies
@@ -590,5 +590,10 @@ def test_a_store_is_used_by_one_command_and_no_password_is_kept(tmp_path, monkey
     line = told("runs", "list", store, where, code=1)
     assert "127.0.0.1:1" in line
     assert "secret" not in line
+    assert (
+        without_passwords("postgresql://me:se/c?ret@host:1/kerv?sslmode=off")
+        == "postgresql://me@host:1/kerv?sslmode=off"
+    )
+    assert without_passwords("postgresql://host:1/kerv") == "postgresql://host:1/kerv"
     for url in ("nonsense", "mysql://server/kerv", "postgresql://kerv@host:port/kerv"):
         assert "postgresql://USER@HOST/DB" in told("runs", "list", f"store={url}", where, code=2)

@@ -22,7 +22,7 @@ from typing import Any, TypeVar, cast
 from kerv_cli.base.errors import UnknownName, UsageError, did_you_mean
 from kerv_cli.base.files import read_yaml_lines
 from kerv_cli.base.limits import check_settings, range_of
-from kerv_cli.base.registry import PREFILL, SETTINGS_GROUPS, Part, ProposerPart, part_of, parts
+from kerv_cli.base.registry import PLUGINS, PREFILL, SETTINGS_GROUPS, Part, ProposerPart, part_of, parts
 from kerv_cli.base.settings import choices_of
 
 T = TypeVar("T")
@@ -131,7 +131,11 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
         raise UsageError(f"{lines[error.key]}{error}", error.key) from error
     except (ConfigAttributeError, ConfigKeyError) as error:
         key = key if key in typed else str(error.full_key)
-        hint = did_you_mean(key, _keys(nodes)) or f"see 'kerv {command.replace('_', ' ')} --cfg' for the keys"
+        hint = (
+            _owner(key)
+            or did_you_mean(key, _keys(nodes))
+            or f"see 'kerv {command.replace('_', ' ')} --cfg' for the keys"
+        )
         raise UsageError(f"{lines.get(key, '')}unknown key '{key}': {hint}", key) from error
     except (OmegaConfBaseException, ValueError, TypeError, RecursionError) as error:
         key = getattr(error, "full_key", None) or key
@@ -140,6 +144,13 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
             message += f" {range_of(at)}".rstrip()
         raise UsageError(f"{lines.get(key, '')}{f'{key}: ' if key else ''}{message}", key) from error
     return settings
+
+
+def _owner(key: str) -> str:
+    group, _, name = key.partition(".")
+    choices = _parts_of(group).items() if group in SETTINGS_GROUPS else ()
+    owners = [choice for choice, part in choices if name in {at.name for at in fields(part.settings)}]
+    return f"it belongs to {' or '.join(f'{group}={one}' for one in owners)}" if owners else ""
 
 
 def _typed(overrides: Sequence[str], schema: type) -> dict[str, Any]:
@@ -273,7 +284,10 @@ def _composed(choices: tuple[tuple[str, str], ...], schema: type, conf: Path, ar
     _open_mappings(nodes)
     for group, name in choices:
         if name not in known[group]:
-            raise UnknownName(group, name, known[group])
+            error = UnknownName(group, name, known[group])
+            if group in SETTINGS_GROUPS and not os.environ.get(PLUGINS):
+                raise UsageError(f"{error} (a plugin's name needs {PLUGINS}=MODULE)", group)
+            raise error
         part, values = _choice(group, name)
         if part is not None:
             nodes[group] = OmegaConf.structured(part.default)

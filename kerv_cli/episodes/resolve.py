@@ -428,4 +428,4 @@ def _parted(overrides: Iterable[str], keys: Collection[str]) -> tuple[list[str],
 
 
 def _key(override: str) -> str:
-    return override.partition("=")[0]
+    return override.lstrip("+").partition("=")[0]

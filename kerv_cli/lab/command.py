@@ -44,7 +44,7 @@ def noted(words: Sequence[str]) -> Iterator[None]:
 
 def without_passwords(url: str) -> str:
     """Return a database's URL without passwords, which can be before the host and in the query."""
-    address, _, query = re.sub(r"(://[^/@:]*):[^/@]*@", r"\1@", url).partition("?")
+    address, _, query = re.sub(r"(://[^/@:]*):[^@]*@", r"\1@", url).partition("?")
     pairs = [one for one in query.split("&") if not unquote(one.partition("=")[0]).lower().endswith("password")]
     return "?".join(filter(None, (address, "&".join(pairs))))
 
