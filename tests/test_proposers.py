@@ -70,7 +70,7 @@ def stored(target: CompactTarget, prompt: torch.Tensor, chunks: np.ndarray, left
 F = TypeVar("F", bound=Follower)
 
 
-def after(follower: F, random: np.random.Generator, executed: int) -> F:
+def moved(follower: F, random: np.random.Generator, executed: int) -> F:
     """The follower after some random actions of an episode."""
     follower.reset("t", 0, np.zeros(3))
     for _ in range(executed):
@@ -117,7 +117,7 @@ def test_every_proposer_is_lossless(name, seed, chunk, data):
     boundary = Random(RandomBoundarySettings()) if after is known["hybrid"] else None
     steps = data.draw(st.integers(0, chunk), "steps decoded, 0: all")
     decoder = Decoder(target, Parts(prefill_draft=before, proposer=after, boundary=boundary), chunk=steps)
-    after(decoder, np.random.default_rng(seed), data.draw(st.integers(0, 12), "executed"))
+    moved(decoder, np.random.default_rng(seed), data.draw(st.integers(0, 12), "executed"))
     for _ in range(2):  # the second decode finds the parts as the first left them
         result = decoder.decode_prompt(prompt)
         assert result.tokens == truth[: (steps or chunk) * D]
@@ -126,7 +126,7 @@ def test_every_proposer_is_lossless(name, seed, chunk, data):
 
 
 def test_a_prediction_counts_committed_steps_as_executed():
-    chunk = Chunk(4, SPACE, after(Follower(SPACE), np.random.default_rng(0), 5), None)  # type: ignore[arg-type]
+    chunk = Chunk(4, SPACE, moved(Follower(SPACE), np.random.default_rng(0), 5), None)  # type: ignore[arg-type]
     chunk.tokens = [10, 20, 30, 254, 40]
     proposer = PredictionProposer(Hold(HELD, minimum=1, horizon=4))
     assert proposer.chains(chunk, 7) == [[20, 30, 254, 10, 20, 30, 254]]
@@ -183,7 +183,7 @@ def skipping(left: int = 50, **changes: Any) -> tuple[Decoder, torch.Tensor, lis
     retrieval = retrieval_of(store, target, 1, 16)
     skip = VerifySkip(SimilaritySkipSettings(**changes), retrieval, (0.4, 0.5, 0.9))
     decoder = Decoder(target, Parts(proposer=retrieval, skip=skip))
-    return after(decoder, np.random.default_rng(0), 3), prompt, tokens
+    return moved(decoder, np.random.default_rng(0), 3), prompt, tokens
 
 
 def test_a_similar_enough_chunk_is_executed_without_a_forward():
@@ -230,7 +230,7 @@ def test_nothing_is_skipped_on_the_drafters_side():
         boundary = Random(RandomBoundarySettings(p=p))
         parts = Parts(proposer=HybridProposer(drafting, retrieval), boundary=boundary, skip=decoder.parts.skip)  # type: ignore[arg-type]
         hybrid = Decoder(decoder.target, parts)
-        after(hybrid, np.random.default_rng(0), 3)
+        moved(hybrid, np.random.default_rng(0), 3)
         assert (hybrid.decode_prompt(prompt).forwards > 0) == forwards
 
 

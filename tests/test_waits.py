@@ -11,7 +11,7 @@ import pytest
 import torch
 from pretended_device import DEVICE, Device, move
 from test_decoding_lossless import random_prompt, random_target
-from test_proposers import HELD, D, after, retrieval_of, stored
+from test_proposers import HELD, D, moved, retrieval_of, stored
 
 from kerv_cli.engine.decoder import Decoder, Parts, Stopwatch
 from kerv_cli.engine.record import PHASES
@@ -92,7 +92,7 @@ def test_a_round_waits_once(family, captured, monkeypatch):
     prompt = random_prompt(target, 2)
     truth = Decoder(target).decode_prompt(prompt).tokens
     on_host = Decoder(target, parts_of(family, target, prompt, truth))
-    after(on_host, np.random.default_rng(0), 8)
+    moved(on_host, np.random.default_rng(0), 8)
     wanted = on_host.decode_prompt(prompt)
     assert wanted.tokens == truth
     if captured:
@@ -120,7 +120,7 @@ def test_a_round_waits_once(family, captured, monkeypatch):
 
         for name in ("round", "decode_plainly"):
             monkeypatch.setattr(decoder, name, counted(getattr(decoder, name)))
-        after(decoder, np.random.default_rng(0), 8)
+        moved(decoder, np.random.default_rng(0), 8)
         found = decoder.decode_prompt(prompt.to(DEVICE, non_blocking=True))
     assert found.tokens == truth
     assert found.rounds == wanted.rounds
