@@ -27,7 +27,7 @@ from kerv_cli.base.manifests import read_file
 from kerv_cli.base.paths import find_target, shipped_dir
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Chunk, Follower
-from kerv_cli.engine.record import Round
+from kerv_cli.engine.record import Round, variability
 from kerv_cli.lab.database import Database
 from kerv_cli.methods.artifacts import MadeFor
 from kerv_cli.methods.calibration import (
@@ -197,7 +197,8 @@ def test_variability_is_the_mean_difference_of_the_judged_tokens():
     def play(start, drafted, target_tokens):
         played = Round("verify", "x", start, drafted, target_tokens, 0, 1, len(drafted), ())
         chunk.commit(played, [0])
-        return None if chunk.variability is None else chunk.variability / BIN
+        found = variability(chunk.rounds, SPACE)
+        return None if found is None else found / BIN
 
     assert play(0, (), (100,)) is None
     assert play(3, (254,), (0,)) is None  # the gripper alone: nothing that moves was judged

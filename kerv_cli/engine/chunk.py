@@ -15,7 +15,7 @@ import numpy as np
 
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation
-from kerv_cli.engine.decisions import ROOT, Choice, Rectified, SkipDecision, TokenTree
+from kerv_cli.engine.decisions import ROOT, Choice, Judged, Rectified, SkipDecision
 from kerv_cli.engine.record import PARALLEL, DecodeRecord, Round, variability
 
 if TYPE_CHECKING:
@@ -94,20 +94,6 @@ class Follower:
         """End the episode. `success` says whether the task was solved."""
 
 
-@dataclass(frozen=True)
-class Rejection:
-    """Tokens of the draft and of the target after a rejected draft token.
-
-    Attributes:
-        draft: The n draft tokens after the rejected one.
-        target: n + 1 tokens: the target's prediction after the rejected token, then after each token of `draft`. The
-            target predicts as if the rejected token and `draft` had been committed.
-    """
-
-    draft: tuple[int, ...] = ()
-    target: tuple[int, ...] = ()
-
-
 @dataclass(eq=False)
 class TargetSide:
     """What the target holds for one chunk: the prompt, the cache, and hidden states.
@@ -162,10 +148,7 @@ class Chunk:
         choice: What the method's boundary decided about this chunk. None if the method has no boundary.
         tokens: The committed tokens.
         rounds: Records of the rounds so far.
-        rejection: Tokens of the draft and of the target after the draft token that the last round rejected, see
-            `Rejection`. Empty if the last round rejected no token.
-        verified_in_prefill: The draft that the prefill verified, and the target's prediction after the last committed
-            token and after each node. Empty if it verified none.
+        judged: The draft that the last round verified. Empty if it verified none.
         forwards: Number of forwards of the target so far.
         similarity: Cosine of the most similar entry of a datastore. None if no part searched.
         reason: The skip rule's reason to skip or to verify. None if there is no reason.
@@ -183,8 +166,7 @@ class Chunk:
     choice: Choice | None = None
     tokens: list[int] = field(default_factory=list)
     rounds: list[Round] = field(default_factory=list)
-    rejection: Rejection = Rejection()
-    verified_in_prefill: tuple[TokenTree, Sequence[int]] = TokenTree((), (), ()), ()
+    judged: Judged = field(default_factory=Judged)
     forwards: int = 0
     similarity: float | None = None
     reason: str | None = None
@@ -215,14 +197,6 @@ class Chunk:
     def compensated(self) -> int:
         return len(self.filled) if self.closed is None else max(0, self.closed.size - len(self.tokens))
 
-    @property
-    def variability(self) -> float | None:
-        """Kinematic variability K: the mean difference of draft and target tokens, in normalised action units.
-
-        None if no draft token was compared, or if tokens have no distance (docs/methods.md §3.2).
-        """
-        return variability(self.rounds, self.space)
-
     def distance(self, tokens: Sequence[int], others: Sequence[int]) -> float:
         """Return the mean absolute difference of two token sequences, in normalised action units.
 
@@ -235,13 +209,13 @@ class Chunk:
         return float(np.abs(self.space.values_of(first) - self.space.values_of(second)).mean())
 
     def targets_along(self, chain: Sequence[int]) -> list[int] | None:
-        """Return the target's predictions along a chain of the draft that the prefill verified.
+        """Return the target's predictions along a chain of the draft that the prefill verified. Call it in that round.
 
         Returns:
             The target's token at each verified position, N − 1 or N tokens. None if the prefill verified fewer than
             N − 1 tokens of this chain.
         """
-        tree, target_tokens = self.verified_in_prefill
+        tree, target_tokens, _ = self.judged
         nodes = {pair: node for node, pair in enumerate(zip(tree.parents, tree.tokens, strict=True))}
         node, targets = ROOT, list[int]()
         for token in chain:
@@ -251,16 +225,12 @@ class Chunk:
             node = nodes[node, token]
         return targets if len(targets) >= self.size - 1 else None
 
-    def commit(self, record: Round, tokens: Sequence[int], rejection: Rejection | None = None) -> None:
-        """Commit the tokens that one forward of the target decided.
-
-        Args:
-            rejection: Tokens of the draft and of the target after the rejected token. None if no token was rejected.
-        """
+    def commit(self, record: Round, tokens: Sequence[int], judged: Judged | None = None) -> None:
+        """Commit the tokens that one forward of the target decided. `judged` is the draft, if it verified one."""
         self.forwards += 1
         self.tokens += tokens
         self.rounds.append(record)
-        self.rejection = rejection or Rejection()
+        self.judged = judged or Judged()
 
     def commit_token(self, token: int) -> None:
         mode, start = "decode" if self.tokens else "prefill", len(self.tokens)
@@ -334,24 +304,12 @@ class Chunk:
             phases=phases,
             compensated=self.compensated,
             filled=tuple(self.filled),
-            variability=self.variability,
+            variability=variability(self.rounds, self.space),
             skipped=any(one.mode == "skip" for one in self.rounds),
             similarity=self.similarity,
             metric=self.choice.metric if self.choice is not None else None,
             reason=self.reason,
         )
-
-
-def deviation(space: ActionSpace, actions: np.ndarray, autoregressive: np.ndarray) -> float:
-    """Return the mean absolute difference between two chunks of actions, in normalised action units.
-
-    Args:
-        actions: The method's actions (h, D), environment units.
-        autoregressive: The actions of autoregressive decoding (H, D), environment units. Only the first h ≤ H are
-            compared.
-    """
-    gap = space.normalise(actions) - space.normalise(autoregressive[: len(actions)])
-    return float(np.abs(gap).mean())
 
 
 def check_tokens(tokens: np.ndarray, vocabulary: int, proposer: str) -> None:

@@ -85,6 +85,25 @@ def merge(chains: Sequence[Sequence[int]]) -> TokenTree:
     return TokenTree.build(tokens, parents)
 
 
+class Judged(NamedTuple):
+    """A draft that the target verified.
+
+    Attributes:
+        tree: The draft, n nodes.
+        target_tokens: The target's prediction after the last committed token, then after each of the n nodes.
+        rejected: Index of the rejected node. None if no node was rejected.
+    """
+
+    tree: TokenTree = TokenTree((), (), ())
+    target_tokens: Sequence[int] = ()
+    rejected: int | None = None
+
+    @property
+    def rest(self) -> list[int]:
+        """The rejected node, and the draft after it. The target predicts there as if it had been committed."""
+        return [] if self.rejected is None else self.tree.down_from(self.rejected)
+
+
 @dataclass(frozen=True)
 class Choice:
     """What a boundary decides about the next chunk: who drafts it, and how many tokens to decode."""

@@ -19,8 +19,8 @@ from torch import Tensor
 
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.acceptance import Accepted, DistanceRule, StrictRule
-from kerv_cli.engine.chunk import Chunk, Follower, Rejection, TargetSide, chunk_steps, deviation
-from kerv_cli.engine.decisions import TokenTree
+from kerv_cli.engine.chunk import Chunk, Follower, TargetSide, chunk_steps
+from kerv_cli.engine.decisions import Judged, TokenTree
 from kerv_cli.engine.draft import EMPTY, Draft, read, upload
 from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold
 from kerv_cli.engine.proposer import Proposer
@@ -169,8 +169,9 @@ class Decoder(Follower):
         self.decodes += 1
         if not self.deviation_every or self.decodes % self.deviation_every:
             return record
-        autoregressive = self.autoregressive.decode(observation).actions
-        return replace(record, deviation=deviation(self.space, actions, autoregressive))
+        autoregressive = self.autoregressive.decode(observation).actions[: len(actions)]
+        gap = self.space.normalise(actions) - self.space.normalise(autoregressive)
+        return replace(record, deviation=float(np.abs(gap).mean()))
 
     @torch.inference_mode()
     def decode_prompt(self, prompt: Tensor | Callable[[], Tensor], stopwatch: Stopwatch | None = None) -> Chunk:
@@ -320,9 +321,6 @@ class Decoder(Follower):
             chunk.commit_token(target_tokens[0])
             return self._keep(chunk, verified, [])
         start, nodes = len(chunk.tokens), path if rejected is None else (*path, rejected)
-        if not start:
-            chunk.verified_in_prefill = tree, target_tokens
-        after_rejection = [] if rejected is None else tree.down_from(rejected)
         is_full = start + len(path) == chunk.size or (bool(path) and tree.tokens[path[-1]] == self.space.end)
         bonus = [] if is_full else [target_tokens[path[-1] + 1 if path else 0]]
         targets = [target_tokens[tree.parents[node] + 1] for node in nodes]
@@ -338,11 +336,8 @@ class Decoder(Follower):
             threshold=self.acceptance.of_drafts_from(proposer.name).limits(self.threshold.radius()),
             levels=verified.levels,
         )
-        rejection = Rejection(
-            draft=tuple(tree.tokens[node] for node in after_rejection[1:]),
-            target=tuple(target_tokens[node + 1] for node in after_rejection),
-        )
-        chunk.commit(record, [tree.tokens[node] for node in path] + bonus, rejection)
+        judged = Judged(tree, target_tokens, rejected)
+        chunk.commit(record, [tree.tokens[node] for node in path] + bonus, judged)
         return self._keep(chunk, verified, list(path))
 
     def _keep(self, chunk: Chunk, verified: Verified, rows: list[int]) -> Tensor:

@@ -44,7 +44,8 @@ class JacobiProposer(ChainProposer):
     guess: list[int]
 
     def begin(self, chunk: Chunk) -> None:
-        tokens = chunk.rejection.target[: chunk.remaining]
+        judged = chunk.judged
+        tokens = [judged.target_tokens[node + 1] for node in judged.rest][: chunk.remaining]
         filler = chunk.space.tokens // 2 if chunk.space.end is None else chunk.space.end
         self.guess = [*tokens, *[filler] * (chunk.remaining - len(tokens))]
 

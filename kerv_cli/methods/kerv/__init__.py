@@ -142,7 +142,8 @@ class Compensation(Rectifier):
         if self.resting:
             return None
         tokens = chunk.tokens if self.settings.use_target_token else chunk.tokens[:-1]
-        drafted = chunk.rejection.draft if self.settings.predictor == DRAFT else ()
+        rest = chunk.judged.rest[1:] if self.settings.predictor == DRAFT else []
+        drafted = [chunk.judged.tree.tokens[node] for node in rest]
         values = assemble(tokens, chunk, self.predictor, self.settings, drafted)
         if values is None or (not self.settings.drop and values.size <= len(tokens)):
             return None
