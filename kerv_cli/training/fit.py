@@ -267,9 +267,9 @@ def resumes(folder: Path, identity: str, setting: str, replace: bool, begun: boo
         return not replace  # reading the state then says what is damaged
     if stored != identity and not replace:
         raise UsageError(
-            f"{folder} holds a run with other settings or data: choose another {setting}=, or type replace=true"
+            f"{folder} holds a run with other settings or data: choose another {setting}=NAME, or type replace=true"
         )
-    return bool(stored == identity)
+    return bool(stored == identity and (begun or not replace))
 
 
 def read_state(path: Path) -> dict[str, Any]:
