@@ -3,9 +3,9 @@
 import html
 import io
 import shlex
-import threading
+import subprocess
+import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
@@ -22,8 +22,9 @@ from starlette.testclient import TestClient
 from studies_synthetic import episode, settings_of, study_of, swept, threshold_study
 
 from kerv_cli.board.app import make_app
-from kerv_cli.board.episode import RECORDER, command_of, record_episode
+from kerv_cli.board.episode import command_of
 from kerv_cli.board.episodes import phase_of
+from kerv_cli.board.recorder import record_episode
 from kerv_cli.catalogue.episodes import find_episode
 from kerv_cli.engine.record import Delay
 from kerv_cli.episodes.resolve import resolve_rollout
@@ -188,23 +189,31 @@ def test_settings_that_adapt_are_repeated_with_the_episodes_before(tmp_path):
 
 def test_an_episode_whose_policy_has_changed_is_not_recorded(tmp_path):
     store, _ = swept(tmp_path, threshold_study(["reach-v3"]))
-    one = find_episode(store.database, rows_of_wanted(store.database)[0]).episode
-    error = record_episode(one.setting, one.task, [one.seed], str(tmp_path), store.rollouts / one.recording)
-    assert "of ar has changed" in error
+    found = find_episode(store.database, rows_of_wanted(store.database)[0])
+    assert "of ar has changed" in record_episode(found)
     assert not store.recordings
 
 
-def test_pages_that_load_do_not_end_the_thread_that_started_a_recording(address, rolled, monkeypatch):
-    """With that thread the kernel would end the process that records."""
-    starters = []
-    monkeypatch.setattr(RECORDER, "record", lambda found: starters.append(threading.current_thread()))
-    monkeypatch.setattr("anyio._backends._asyncio.WorkerThread.MAX_IDLE_TIME", 0)  # seconds, else 10
-    urlopen(Request(f"{address}/episodes/{rows_of_wanted(rolled)[0]}/record", method="POST"))
-    with ThreadPoolExecutor(4) as pages:
-        for _ in range(10):
-            list(pages.map(urlopen, [address] * 4))
-    time.sleep(0.2)
-    assert starters[0].is_alive()
+def children(parent: int) -> set[int]:
+    rows = subprocess.run(["ps", "-eo", "pid=,ppid="], capture_output=True, text=True, check=True).stdout.split("\n")
+    pairs = [tuple(map(int, row.split())) for row in rows if row.strip()]
+    return {pid for pid, above in pairs if above == parent}
+
+
+def test_a_board_that_is_killed_leaves_no_process_that_records(rolled):
+    words = [sys.executable, "-m", "kerv_cli", "board", "port=0", "open=false", f"results={rolled.results}"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as board:
+        address = board.stdout.readline().split()[0]
+        urlopen(Request(f"{address}episodes/{rows_of_wanted(rolled)[0]}/record", method="POST"))
+        recording = children(board.pid)
+        assert len(recording) == 1
+        board.kill()
+    for _ in range(100):
+        left = {pid for pid in recording if Path(f"/proc/{pid}").exists()}
+        if not left:
+            break
+        time.sleep(0.1)
+    assert not left
 
 
 def test_a_person_gets_from_a_failure_to_its_film_a_decode_and_rerun(page, address, rolled):

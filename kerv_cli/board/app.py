@@ -24,8 +24,9 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from kerv_cli.base.errors import KervError, UsageError
-from kerv_cli.board import episode, episodes, runs
+from kerv_cli.board import episodes, runs
 from kerv_cli.board.pages import render
+from kerv_cli.board.recorder import RECORDER
 from kerv_cli.lab.database import Database
 
 HOST = "127.0.0.1"
@@ -146,4 +147,4 @@ def serve(database: Database, port: int, opened: Callable[[str], None], browser:
             answering.join()
         server.should_exit = True
         answering.join(LAST_ANSWERS)
-        episode.RECORDER.close()
+        RECORDER.close()

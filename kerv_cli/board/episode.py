@@ -10,145 +10,31 @@ import shlex
 import signal
 import socket
 import subprocess
-import threading
 import time
 import urllib.request
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import Future
-from dataclasses import dataclass
 from operator import attrgetter
-from pathlib import Path
 from typing import Any
 from urllib.error import URLError
 from urllib.parse import quote
 
-from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
 from kerv_cli.base.errors import NO_RERUN, KervError, has_rerun
-from kerv_cli.base.processes import Workers
 from kerv_cli.board.pages import CONTENT_POLICY, database_of, inside, render
+from kerv_cli.board.recorder import RECORDER
 from kerv_cli.catalogue.episodes import FoundEpisode, find_episode, outcomes
 from kerv_cli.engine.record import PHASES, DecodeRecord
-from kerv_cli.episodes.identity import Setting
+from kerv_cli.report.tables import dof_names
 from kerv_cli.report.viewing.token_outcomes import OUTCOMES, chunk_size, outcomes_of, token_names, tokens_hash
 from kerv_cli.report.viewing.viewer import Film, animation, film_of, viewer_command
-from kerv_cli.worlds import specs
 
 SLOWER = 2
 """Factor by which a film plays slower than the robot moves."""
-IDLE_SECONDS = 60
-"""Seconds without work after which the recording process ends, to free its memory."""
-
-
-@dataclass(frozen=True)
-class Job:
-    """A recording that the user asked for.
-
-    Attributes:
-        future: Running job. Its result is the error as text, or an empty text if the recording was written.
-        asked: Time at which the user asked for it, seconds since 1970.
-    """
-
-    future: Future[str]
-    asked: float
-
-    @property
-    def seconds(self) -> int:
-        """Seconds since the user asked for the recording."""
-        return int(time.time() - self.asked)
-
-    @property
-    def error(self) -> str:
-        """Why the recording failed. Empty if it succeeded or still runs."""
-        if not self.future.done():
-            return ""
-        lost = self.future.exception()
-        return f"the recording process ended: {lost}" if lost else self.future.result()
-
-
-class Recorder:
-    """Records episodes in one process. Asking for an episode that is being recorded already does nothing."""
-
-    def __init__(self) -> None:
-        self._jobs: dict[Path, Job] = {}
-        self._pool: Workers | None = None
-        self._latest: Future[str] | None = None
-        self._lock = threading.RLock()
-
-    def job(self, path: Path) -> Job | None:
-        """Return the newest job that writes this file. None if nobody asked for such a job."""
-        return self._jobs.get(path)
-
-    def record(self, found: FoundEpisode) -> None:
-        """Start to record an episode, unless it is being recorded already.
-
-        Call this method in a thread that lives as long as the board. The recording process ends with that thread.
-        """
-        path = found.recording
-        with self._lock:
-            job = self._jobs.get(path)
-            if job is not None and not job.future.done():
-                return
-            if self._pool is None or self._pool.is_broken:
-                self._pool = Workers(1)
-            one, results = found.episode, str(found.store.database.results)
-            seeds = [*found.earlier, one.seed]
-            work = self._pool.submit(record_episode, one.setting, one.task, seeds, results, path)
-            self._jobs[path], self._latest = Job(work, time.time()), work
-        work.add_done_callback(self._rest)
-
-    def _rest(self, work: Future[str]) -> None:
-        """End the recording process after IDLE_SECONDS, unless a newer recording than `work` was asked for."""
-
-        def end() -> None:
-            with self._lock:
-                if work is self._latest:
-                    self.close()
-
-        timer = threading.Timer(IDLE_SECONDS, end)
-        timer.daemon = True
-        timer.start()
-
-    def close(self) -> None:
-        """End the recording process at once, even during a recording."""
-        if self._pool is not None:
-            self._pool.kill()
-            self._pool = None
-
-
-def record_episode(setting: Setting, task: str, seeds: list[int], results: str, path: Path) -> str:
-    """Run an episode again and write its recording.
-
-    Args:
-        setting: Setting of the episode.
-        task: Task of the episode.
-        seeds: Seeds of the episodes that must run first, then the episode's own.
-        results: The results folder, with the weights and data that the setting needs.
-        path: File to write.
-
-    Returns:
-        The error in one line. Empty if the recording was written.
-    """
-    from kerv_cli.episodes.runner import Runner
-    from kerv_cli.lab.work import checked, failure_of
-    from kerv_cli.report.viewing import save_recording
-
-    try:
-        runner = Runner(checked(setting, [task], results).on(task), task)
-        for seed in seeds[:-1]:
-            runner.episode(seed)
-        save_recording(runner.episode(seeds[-1], recorded=True), path, setting.label)
-    except Exception as error:  # noqa: BLE001 - the page shows it, whatever it is
-        return failure_of(error).reason
-    return ""
-
-
-RECORDER = Recorder()
 
 
 def _found(request: Request) -> FoundEpisode:
@@ -157,15 +43,6 @@ def _found(request: Request) -> FoundEpisode:
 
 def _film(request: Request) -> Film:
     return film_of(inside(request, _found(request).recording))
-
-
-def _names(task: str, decodes: Sequence[DecodeRecord]) -> Sequence[str]:
-    """Return the names of the D degrees of freedom of a task. If the task is unknown here, the names are 0, 1, …."""
-    dofs = max((decode.actions.shape[1] for decode in decodes if decode.actions.ndim == 2), default=1)
-    for spec in specs().values():
-        if task in spec.tasks and len(spec.actions.names) == dofs:
-            return spec.actions.names
-    return list(map(str, range(dofs)))
 
 
 def command_of(found: FoundEpisode) -> tuple[str, str]:
@@ -189,7 +66,8 @@ def show_episode(request: Request) -> Response:
     """Show one episode. `?decode=N` chooses a decode."""
     found = _found(request)
     (decodes, steps), episode, row = found.decodes(), found.episode, found.row
-    dofs = _names(episode.task, decodes)
+    number = max((decode.actions.shape[1] for decode in decodes if decode.actions.ndim == 2), default=1)
+    dofs = dof_names(episode.task, number)
     names = token_names(decodes, dofs)
     size = chunk_size(decodes, len(names))
     chunks = [outcomes_of(decode, size, len(names)) for decode in decodes]
@@ -242,15 +120,10 @@ def show_film(request: Request) -> Response:
     return render(request, "episode_film.html", **_film_values(request, _found(request)))
 
 
-async def record(request: Request) -> Response:
-    """Start to record an episode, unless it is being recorded already.
-
-    The recording process is started in this function's thread, which lives as long as the board. The other threads,
-    which make pages, end earlier. The kernel ends a process when the thread that started it ends (`begin_worker`).
-    """
-    found = await run_in_threadpool(_found, request)
-    RECORDER.record(found)
-    return await run_in_threadpool(show_film, request)
+def record(request: Request) -> Response:
+    """Start to record an episode, unless it is being recorded already."""
+    RECORDER.record(_found(request))
+    return show_film(request)
 
 
 _FOREVER = {"cache-control": "max-age=86400"}
