@@ -45,6 +45,7 @@ SWEEP, ROLLOUT = "sweep", "rollout"
 """Kinds of studies, made by `kerv sweep` and `kerv rollout`."""
 _FOLDERS = {SWEEP: "studies", ROLLOUT: "rollouts"}
 _AT_ONCE = 500  # most values in one SQL IN (…)
+_ROWS = 2000  # rows of a frame that are read at a time
 ABOUT = ("title", "baseline", "axis", "note", "block", "machines")
 """Fields of a `Study` that are stored as one JSON value."""
 
@@ -370,26 +371,38 @@ class Study:
             query = (
                 sa.select(
                     SETTINGS.c.label, WANTED.c.task, WANTED.c.seed, EPISODES.c.id.label("episode"),
-                    *measures_in(connection), *circumstances, BLOCKS.c.run, BLOCKS.c.about,
+                    *measures_in(connection), *circumstances, BLOCKS.c.run,
                 )
                 .select_from(PLANNED.join(EPISODES, which).join(BLOCKS))
                 .where(STUDIES.c.name == self.name, *([] if run is None else [BLOCKS.c.run == run]))
                 .order_by(WANTED.c.position)
             )  # fmt: skip
-            frame = pd.DataFrame(connection.execute(query).mappings().all())
-            if frame.empty:
-                return frame
+            found = connection.execution_options(yield_per=_ROWS).execute(query)
+            # part by part: the rows as Python objects take ten times the frame's memory
+            parts = [pd.DataFrame.from_records(rows, columns=list(found.keys())) for rows in found.partitions()]
+            if not parts:
+                return pd.DataFrame()
+            frame = pd.concat(parts, ignore_index=True)
+            about = self._about_blocks(connection, frame["block"].unique().tolist())
             numbers = [column.name for column in MEASURES if isinstance(column.type, sa.Double | sa.BigInteger)]
             frame[numbers] = frame[numbers].apply(pd.to_numeric)
             unknown = frame[numbers].isna().all()
             frame = frame.astype(dict.fromkeys(unknown.index[unknown], float))
             frame["decode_seconds"] = frame["decode_seconds"].map(lambda blob: np.frombuffer(blob, "<f8"))
-            about = pd.DataFrame(list(frame.pop("about")), index=frame.index)
         if episodes is not None:
             chosen = [(one.setting.label, one.task, one.seed) for one in episodes]
-            mine = pd.MultiIndex.from_frame(frame[["label", "task", "seed"]]).isin(chosen)
-            frame, about = frame[mine], about[mine]
-        return pd.concat([frame, about], axis=1).reset_index(drop=True)
+            frame = frame[pd.MultiIndex.from_frame(frame[["label", "task", "seed"]]).isin(chosen)]
+        return frame.join(pd.DataFrame.from_dict(about, orient="index"), on="block").reset_index(drop=True)
+
+    def _about_blocks(self, connection: sa.Connection, blocks: Sequence[str]) -> dict[str, Any]:
+        """Return machine and versions of each block, by the block's id."""
+        about: dict[str, Any] = {}
+        for first in range(0, len(blocks), _AT_ONCE):
+            some = BLOCKS.c.id.in_(blocks[first : first + _AT_ONCE])
+            about |= {
+                row.id: row.about for row in connection.execute(sa.select(BLOCKS.c.id, BLOCKS.c.about).where(some))
+            }
+        return about
 
     def decodes(self, episodes: Sequence[int], columns: Sequence[str] | None = None) -> pa.Table:
         """Return the decodes of several episodes in one table. Its column `episode` is an index into `episodes`.

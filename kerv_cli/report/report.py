@@ -256,7 +256,7 @@ def study_parts(report: Report) -> dict[str, Any]:
         "meanings": {name: text.format(study.baseline) for name, text in MEANINGS.items()},
         "shown": columns_shown(suite),
         "suite": suite,
-        "charts": [figure.to_dict() for figure in report.figures.values()],
+        "charts": [figure.to_dict(validate=False) for figure in report.figures.values()],
         "has_bounds": "tradeoff" in report.figures,
         "has_acceptance": "acceptance" in report.figures,
         "tasks": task_table(data.task_results),
@@ -292,16 +292,14 @@ def _films(data: StudyData) -> list[dict[str, Any]]:
     films. A film is a dictionary with the setting's label, the task, the seed, the outcome, the number of steps and
     the GIF in base64.
     """
-    if not has_rerun():
-        return []
-    keys = ["label", "task", "seed"]
-    outcomes = data.episodes.set_index(keys)["success"].to_dict()
+    recorded = {path.name for path in data.study.recordings} if has_rerun() else set()
+    outcomes = data.episodes.set_index(["label", "task", "seed"])["success"].to_dict() if recorded else {}
     films: dict[tuple[str, bool], dict[str, Any]] = {}
-    for one in data.study.episodes:
-        path, method = data.study.rollouts / one.recording, one.setting.settings["method"]
-        success = outcomes.get((one.setting.label, *one.key[1:]))
-        if success is None or (method, success) in films or not path.is_file():
+    for one in data.study.episodes if recorded else ():
+        method, success = one.setting.settings["method"], outcomes.get((one.setting.label, *one.key[1:]))
+        if success is None or (method, success) in films or one.recording not in recorded:
             continue
+        path = data.study.rollouts / one.recording
         if (film := film_of(path)).frames:
             slower = min(2.0, _FRAMES / len(film.frames))
             picture = base64.b64encode(animation(film, slower)).decode()

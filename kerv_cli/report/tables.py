@@ -48,7 +48,7 @@ SOLVED = 0.20
 """Smallest success rate at which the baseline counts as solving its tasks."""
 NO_STRESS = "none"
 _AT_ONCE = 200  # episodes in memory at a time
-MOST_TALLIED = 1000
+MOST_TALLIED = 500
 """Number of episodes of a setting whose decodes are read, to count accepted tokens by position and DoF."""
 NO_TALLY = Tally.of_records((), 0)
 _ONE_STATE = ("engine", "git_commit", "device_name")
@@ -337,7 +337,7 @@ def _results(data: StudyData, averaging: str) -> list[Result]:
             hashes=hashes,
             stress=stress["kind"],
             stress_level=stress["level"],
-            provenance={name: _joined(part[name]) for name in _PROVENANCE},
+            provenance={name: _joined(part[name].unique()) for name in _PROVENANCE},
         )
         results.append(row)
     return results
@@ -438,7 +438,7 @@ def differences(first: Row, second: Row) -> list[Row]:
 
 def _joined(values: Iterable[object]) -> str:
     """Return all different values except None as one text, separated by semicolons."""
-    return ";".join(dict.fromkeys(str(value) for value in values if value is not None))
+    return ";".join(dict.fromkeys(str(value) for value in dict.fromkeys(values) if value is not None))
 
 
 def split_values(texts: Iterable[object]) -> set[str]:
