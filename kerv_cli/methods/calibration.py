@@ -25,12 +25,7 @@ AGAIN = "run 'kerv calibrate replace=true' with the same policy.target= and poli
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """The demonstrations that a calibration was measured on.
-
-    Attributes:
-        sha256: Hash of the demonstrations.
-        tasks: For each task, by its full name: `{"training": n}`, where n is its number of training episodes.
-    """
+    """The demonstrations of a calibration: their hash, and per task `{"training": number of episodes}`."""
 
     sha256: str
     tasks: dict[str, dict[str, int]]
@@ -38,13 +33,12 @@ class Demonstrations:
 
 @dataclass(frozen=True)
 class Variability:
-    """Typical variability K of a task. K is the mean distance of a decode's drafts to the target's tokens (§3.2).
+    """Typical variability K of a task (docs/methods.md §3.2).
 
     Attributes:
-        k_s: Reference level K_S: the median K over the decodes that were measured, in normalised action units.
-        decodes: Number of decodes that were measured.
-        levels: Median of K for each way to compute K, by its name in `MEASURES`. The median for `MEAN` is `k_s`.
-            Empty in calibrations before version 1.1.
+        k_s: Reference level K_S: the median K over the measured decodes, normalised action units.
+        decodes: Number of measured decodes.
+        levels: Median of K by its name in `MEASURES`. Empty in calibrations before version 1.1.
     """
 
     k_s: float
@@ -54,16 +48,7 @@ class Variability:
 
 @dataclass(frozen=True)
 class BoundarySection:
-    """Ranges of the radius of curvature and of the length of the hand's path, in the demonstrations.
-
-    HeiSD's boundary chooses between retrieval and the drafter (docs/methods.md §4.4). It scales the radius and the
-    length of the robot's own path to [0, 1] by these ranges.
-
-    Attributes:
-        episodes: Number of episodes that were measured.
-        windows: The ranges for each window size. The key is the number of newest hand positions that the boundary looks
-            at, as text, such as `15`.
-    """
+    """Ranges by which HeiSD's boundary scales its path (§4.4), by the number of hand positions as text, as `15`."""
 
     episodes: int
     windows: dict[str, BoundaryRanges]
@@ -71,22 +56,18 @@ class BoundarySection:
 
 @dataclass(frozen=True)
 class SkipLevel:
-    """The threshold s_min of a task: the similarity at which verification is skipped (docs/methods.md §4.3).
+    """The similarity (cosine) s_min at which verification of a task is skipped (docs/methods.md §4.3).
 
-    Similarities are cosines. To measure the threshold, entries of the datastore were compared with their neighbours. An
-    entry's neighbour is the most similar entry of another episode. A neighbour is good if its chunk is close to the
-    entry's chunk (`SkipSection.epsilon`).
+    A match is a datastore entry and the most similar entry of another episode.
 
     Attributes:
-        s_min: A stored chunk is executed without verification if the similarity of its observation is at least `s_min`.
-        low: Lowest value of `s_min` that a skip rule may set, if it changes `s_min` after each episode.
-        high: Highest value of `s_min` that such a skip rule may set.
-        share: Share of the entries whose neighbour has a similarity of at least `s_min`.
-        entries: Number of entries whose neighbours were looked up.
-        within: Share of good neighbours among the neighbours with a similarity of at least `s_min`. None if there are
-            no such neighbours.
-        error: Mean absolute difference between the chunks of an entry and its neighbour, in normalised action units.
-            Only neighbours with a similarity of at least `s_min` count. None if there are no such neighbours.
+        s_min: A stored chunk is executed without verification from this similarity on.
+        low: Lowest value to which a skip rule may move s_min.
+        high: Highest such value.
+        share: Share of the matches that are at least so similar.
+        entries: Number of matches.
+        within: Share of good ones among these. None if there are none.
+        error: Their mean absolute difference, normalised action units. None if there are none.
     """
 
     s_min: float
@@ -102,16 +83,11 @@ class SkipLevel:
 class SkipSection:
     """How similar a stored observation must be so that verification is skipped, for one datastore.
 
-    To measure them, entries of the datastore were compared with their neighbours. An entry's neighbour is the most
-    similar entry of another episode.
-
     Attributes:
         datastore: Hash of the datastore.
-        epsilon: A neighbour is good if the distance between its chunk and the entry's chunk is at most `epsilon`. The
-            distance is the mean absolute difference in normalised action units. Strict tokens, such as the gripper's,
-            must also be equal.
-        confidence: Minimum share of good neighbours among the neighbours whose similarity is at least `s_min`.
-        tasks: The threshold `s_min` of each task, with its bounds.
+        epsilon: A match is good up to this mean absolute difference of the chunks, normalised action units.
+        confidence: Minimum share of good matches from s_min on.
+        tasks: s_min of each task.
     """
 
     datastore: str
@@ -122,17 +98,9 @@ class SkipSection:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Contents of `calibration.json`. A section that was not measured is None or empty.
+    """Contents of `calibration.json` (docs/formats.md). A section that was not measured is None or empty.
 
-    Attributes:
-        target: The target that was measured.
-        demos: The demonstrations.
-        window: Number of past actions that a predictor reads, one per control step.
-        noise: Noise of the Kalman filter per DoF, by the filter's name, `kalman`.
-        variability: Typical kinematic variability K of each task, with its reference level K_S.
-        boundary: Ranges of the hand's path, by which HeiSD's boundary scales radius of curvature and path length.
-        skip: Thresholds at which verification is skipped.
-        provenance: How the calibration was made.
+    `window` is the number of past actions that a predictor reads. `noise` is by the filter's name, `kalman`.
     """
 
     target: MadeFor

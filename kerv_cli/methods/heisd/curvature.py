@@ -19,16 +19,12 @@ STRAIGHT = 1e-6  # points form a line if their spread across it is less than thi
 
 
 def radius_of_curvature(points: np.ndarray) -> float:
-    """Fit a circle to a path, and return its radius in metres.
+    """Fit a circle to a path (n, 3) by Taubin's algebraic method, and return its radius. All in metres.
 
-    The radius is infinite for fewer than three points, for a hand at rest and for a straight line. The points are
-    projected onto the plane that fits them best (by SVD). Taubin's algebraic method, which is exact on arcs, fits the
-    circle. For this, the points (x, y) are centred, and divided by `scale`, their root mean square distance from the
-    centre. Let z = x² + y². Let (a, b, c) be the right singular vector for the smallest singular value of the matrix
-    with rows [(z − 1) / 2, x, y]. Then the radius is scale / |a|.
-
-    Args:
-        points: (n, 3) positions, metres.
+    The radius is infinite for fewer than three points, for a hand at rest and for a straight line. The points (x, y) in
+    the plane that fits best (by SVD) are centred, and divided by `scale`, their root mean square distance from the
+    centre. With z = x² + y² and (a, b, c) the right singular vector for the smallest singular value of the matrix with
+    rows [(z − 1) / 2, x, y], the radius is scale / |a|.
     """
     points = np.asarray(points, dtype=np.float64)
     if len(points) < LEAST:
@@ -49,21 +45,11 @@ def radius_of_curvature(points: np.ndarray) -> float:
 class BoundaryRanges:
     """Ranges of the hand's radius of curvature R and path length D in the training demonstrations, in metres.
 
-    A range goes from the minimum to the 95th percentile. The infinite radii of straight paths do not count, because
-    they would make the range infinite.
+    A range goes from the minimum to the 95th percentile. The infinite radii of straight paths do not count.
 
     Attributes:
-        radius_low: Minimum of R.
-        radius_high: 95th percentile of R.
-        length_low: Minimum of D.
-        length_high: 95th percentile of D.
-        points: A hundred pairs (scaled R, scaled D), each in [0, 1], one pair per window (section of a path). To choose
-            the windows, all windows are sorted by scaled R + scaled D, and a hundred are taken at even spacing. The
-            pairs give the quantiles of F, the weighted sum of scaled R and scaled D. Empty in calibrations before
-            version 1.1.
-
-    Raises:
-        CheckpointError: A range is empty or not finite.
+        points: Pairs (scaled R, scaled D), each in [0, 1], of POINTS windows that are evenly spread in their sum. They
+            give the quantiles of F. Empty in calibrations before version 1.1.
     """
 
     radius_low: float
