@@ -122,9 +122,6 @@ def serve(database: Database, port: int, opened: Callable[[str], None], browser:
         port: Port to listen on. If 0, a free port is used.
         opened: Called with the address as soon as the port is open.
         browser: Whether to open the address in the browser.
-
-    Raises:
-        UsageError: The port cannot be used, for example because another program uses it.
     """
     server = web_server(database)
     with socket.socket() as listening:

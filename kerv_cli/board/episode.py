@@ -167,9 +167,6 @@ def viewer_files() -> dict[str, tuple[bytes, str]]:
 
     Rerun's package offers these files only through its own web server. The server is started for a moment, and only
     this machine can reach it.
-
-    Raises:
-        KervError: The server does not start.
     """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -185,11 +182,7 @@ def viewer_files() -> dict[str, tuple[bytes, str]]:
 
 
 def _fetched(address: str) -> tuple[bytes, str]:
-    """Wait until a server has started. Return content and media type of the file at an address.
-
-    Raises:
-        KervError: The server does not start in time.
-    """
+    """Wait until a server has started. Return content and media type of the file at an address."""
     end = time.monotonic() + _VIEWER_SECONDS
     while True:
         try:

@@ -180,9 +180,6 @@ def _asked(request: Request) -> tuple[list[Cell], dict[str, Any]]:
         cells: All episodes, or only the episodes of the setting and task that the address names.
         values: Values for the templates of both pages: `study`, `baseline`, `known` (all settings and tasks) and
             `chosen` (the setting and task that the address names).
-
-    Raises:
-        UnknownName: The study has no such setting or task.
     """
     store = Study(database_of(request), request.path_params["name"])
     study = store.load()

@@ -44,10 +44,6 @@ def export_board(
         folder: An empty folder.
         advance: Called before each page, with the number of finished pages, the number of all pages that are known so
             far, and the page's address.
-
-    Raises:
-        KervError: A page cannot be shown.
-        OSError: The disk is full or not writable.
     """
     app = make_app(database)
     app.state.only, app.state.live = frozenset(names), False
@@ -98,9 +94,6 @@ def _collected(app: Starlette, advance: Callable[[int, int, str], None]) -> dict
     """Ask for the first page and for all pages and files that it leads to. Return the answers by address.
 
     Failed answers are left out. Parts that a browser loads later (`hx-trigger="load"`) are put into their page.
-
-    Raises:
-        KervError: The first page cannot be shown.
     """
     pages: dict[str, str | bytes] = {}
     waiting, films, episodes = ["/"], 0, 0
@@ -134,7 +127,6 @@ def _collected(app: Starlette, advance: Callable[[int, int, str], None]) -> dict
 
 
 def _filled(app: Starlette, address: str, text: str) -> str:
-    """Fetch the part of a page that a browser loads right after the page, and return the page with this part."""
     late = re.search(r'<(section) id="(\w+)"[^>]* hx-get="([^"]+)" hx-trigger="load".*?</section>', text, re.DOTALL)
     if late is None:
         return text
@@ -152,7 +144,6 @@ def _plain(address: str, link: str) -> str:
 
 
 def _links(address: str, text: str) -> list[str]:
-    """Return the addresses of all links, scripts and images of a page, each once."""
     found = re.findall(r'<(?:a|link|script|img)\b[^>]*?\b(?:href|src)="(?!data:)([^"?#][^"]*)"', text)
     return list(dict.fromkeys(_plain(address, html.unescape(one)) for one in found))
 

@@ -90,11 +90,7 @@ def render(request: Request, template: str, status: int = 200, **values: Any) ->
 
 
 def inside(request: Request, path: Path) -> Path:
-    """Resolve the symbolic links of a path, which must be in the results folder.
-
-    Raises:
-        HTTPException: There is no such file, or the file is outside the results folder.
-    """
+    """Resolve the symbolic links of a path, which must be in the results folder."""
     resolved = path.resolve()
     if not resolved.is_relative_to(database_of(request).results.resolve()) or not resolved.exists():
         raise HTTPException(404, "no such file in the results folder")

@@ -197,7 +197,6 @@ def show_artifact(request: Request, version: str, is_live: bool) -> Response:
 
 
 def _curves(run: RunEntry) -> dict[str, object] | None:
-    """Return the curves of a training as a Vega-Lite chart. None without training, or before the second validation."""
     from kerv_cli.report.plots import curves_figure, read_log
 
     try:

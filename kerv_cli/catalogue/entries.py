@@ -181,10 +181,6 @@ def find_run(database: Database, name: str, exact: bool = False) -> RunEntry:
         database: The database.
         name: Id of the entry, a part of it that no other id contains, or `last` for the newest entry.
         exact: Whether to accept only a whole id.
-
-    Raises:
-        UsageError: Several entries match, or the folder has no entries.
-        UnknownName: The folder has entries, but none matches.
     """
     runs = find_runs(database)
     if not runs:
@@ -212,10 +208,6 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
         filters: The value of each filter, by the filter's name. `kind` is the exact kind. `method`, `task` and `tag`
             are names, or patterns such as `drawer*`. `state` is the beginning of a state, and `since` the earliest
             start time (ISO 8601).
-
-    Raises:
-        UnknownName: A filter, kind or state does not exist.
-        UsageError: `since` is not a date.
     """
     for key in filters:
         if key not in _FILTERS:
@@ -248,9 +240,6 @@ def store_of(run: RunEntry, database: Database) -> Study:
     Args:
         run: The entry.
         database: The database that `find_run` found it in.
-
-    Raises:
-        UsageError: The entry is not a sweep or rollout.
     """
     if not run.has_episodes:
         raise UsageError(f"{run.id} is a {run.kind}: it has no episodes")
@@ -307,9 +296,6 @@ def description_of(run: RunEntry) -> dict[str, Any]:
     """Return the provenance of an artifact: the command, settings and data that made it.
 
     Empty if the provenance is unknown, and for a training that has not reached its first validation.
-
-    Raises:
-        CheckpointError: The artifact's description is damaged.
     """
     return dict(_described(run.folder, run.kind).get("provenance") or {})
 
@@ -410,11 +396,7 @@ def set_labels(database: Database, run: str, labels: Mapping[str, str]) -> None:
 
 
 def check_removable(run: RunEntry) -> None:
-    """Refuse to remove an entry that is in use.
-
-    Raises:
-        UsageError: The entry's folder is a symbolic link, or a process is making the entry.
-    """
+    """Refuse to remove an entry that is in use."""
     if run.folder.is_symlink():
         raise UsageError(f"{run.folder} is a link to {os.readlink(run.folder)}: remove the link, or what it points to")
     if run.is_running:
@@ -430,9 +412,6 @@ def remove(run: RunEntry, database: Database) -> None:
     Args:
         run: The entry to remove.
         database: The database that has the entry's rows.
-
-    Raises:
-        StorageError: The disk is full or not writable.
     """
     gone = set_aside(run.folder)
     if run.has_episodes:
@@ -450,10 +429,6 @@ def plan_of(run: RunEntry, database: Database) -> Study:
     Args:
         run: The sweep or rollout to repeat.
         database: The database that has the sweep or rollout.
-
-    Raises:
-        CheckpointError: The weights or data that the run used have changed since the run.
-        UsageError: A setting cannot run.
     """
     from kerv_cli.lab.study import new_name  # imports torch, which listing runs does not need
     from kerv_cli.lab.work import checked

@@ -110,9 +110,6 @@ def find_episode(database: Database, number: int) -> FoundEpisode:
     Args:
         database: The database.
         number: Row number of the episode.
-
-    Raises:
-        UsageError: There is no such episode, or no study uses it any more, because it was run again.
     """
     with database.reading() as connection:
         own = EPISODES.c["task", "seed", "order", "block", "started"]

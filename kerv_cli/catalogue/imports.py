@@ -51,10 +51,6 @@ def import_databases(database: Database, files: Sequence[Path], name: str = "") 
 
     Returns:
         Names of the imported studies, and a line of text about each study that was left out.
-
-    Raises:
-        UsageError: A file is `database` itself. Or `name` is given, and a file does not hold exactly one study.
-        CheckpointError: A file is damaged, or was written by another version of kerv.
     """
     names, notes = list[str](), list[str]()
     for file in files:
@@ -89,10 +85,6 @@ def connect_foreign(path: Path) -> sqlite3.Connection:
 
     Args:
         path: The file.
-
-    Raises:
-        OSError: The file is missing or is not a regular file.
-        ValueError: The file is incomplete.
     """
     size = regular(path).stat().st_size
     log = path.with_name(f"{path.name}-wal")
@@ -119,9 +111,6 @@ def _in_database(path: Path, database: Database, name: str, stack: contextlib.Ex
         database: The database to import the studies into.
         name: New name of each study. If empty, each study keeps its name.
         stack: The file is closed when this stack is closed.
-
-    Raises:
-        CheckpointError: The file is damaged, or was written by another version of kerv.
     """
     engine = sa.create_engine("sqlite://", creator=lambda: connect_foreign(path), poolclass=sa.pool.NullPool)
     with _damage(path):
@@ -162,9 +151,6 @@ def _stored_episodes(connection: sa.Connection, path: Path, settings: dict[int, 
         connection: The database.
         path: File of that database, for error messages.
         settings: The settings, by their row number in that database.
-
-    Raises:
-        CheckpointError: The file is damaged, or the decodes of an episode are too large.
     """
     blocks, decodes = tables.BLOCKS.c, tables.DECODES
     of_block = blocks.id.label("block"), blocks.about, blocks.run, blocks.seeds
@@ -196,12 +182,7 @@ def _damage(path: Path) -> Iterator[None]:
 
 
 def export_database(study: Study, folder: Path) -> Path:
-    """Write a study into a new kerv.db in a folder, and return that file's path. An existing kerv.db is replaced.
-
-    Raises:
-        UsageError: The folder contains other files than kerv.db.
-        StorageError: The disk is full or not writable.
-    """
+    """Write a study into a new kerv.db in a folder, and return that file's path. An existing kerv.db is replaced."""
 
     def fill(new: Path) -> None:
         copy = Database(new, file_url(new))

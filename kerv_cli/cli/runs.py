@@ -45,9 +45,6 @@ def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a r
         least: Minimum number of names.
         most: Maximum number of names.
         what: What the user must name, for the error message.
-
-    Raises:
-        UsageError: There are too few or too many names.
     """
     from kerv_cli.episodes.resolve import study_name
 

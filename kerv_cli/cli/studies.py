@@ -46,10 +46,6 @@ def planned_study(resolved: ResolvedStudy, command: Sequence[str], is_rollout: b
         resolved: The study with all its settings.
         command: Command-line arguments after `kerv`, to be stored with the episodes.
         is_rollout: Whether to plan a rollout.
-
-    Raises:
-        UsageError: The study cannot run with these settings, or there is no such policy.
-        CheckpointError: The policy is damaged, or an artifact that a method needs is missing or damaged.
     """
     from kerv_cli.episodes.resolve import idle_overrides
 
@@ -145,10 +141,6 @@ def run_study(planned: Study, guess: float = SECONDS_PER_EPISODE) -> Outcome:
     Args:
         planned: The plan.
         guess: Seconds per episode, used while no episode is measured.
-
-    Raises:
-        Interrupted: The user pressed Ctrl-C.
-        KervError: The study could not run, see `study.run`.
     """
     from kerv_cli.lab.study import TimeLeft, run
     from kerv_cli.report.viewing import save_recording

@@ -34,9 +34,6 @@ def _place(settings: CommandSettings, name: str) -> Path:
     Args:
         settings: Settings of the command.
         name: A path, the name of a run, or `last`: the newest run that has recordings.
-
-    Raises:
-        UsageError: There is neither such a path nor such a run, or the run has no folder.
     """
     path = Path(name).expanduser()
     if path.exists() or path.suffix == ".rrd":

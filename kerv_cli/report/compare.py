@@ -57,10 +57,6 @@ def compared_runs(database: Database, name: str) -> list[ComparedRun]:
     Args:
         database: The database.
         name: `ID` stands for every setting of the run with that id, `ID:LABEL` for one setting.
-
-    Raises:
-        UsageError: The run has no such setting.
-        UnknownName: There is no such run.
     """
     identifier, _, label = name.partition(":")
     run = find_run(database, identifier)
@@ -88,11 +84,6 @@ def pairs_to_compare(database: Database, first: str, second: str) -> list[tuple[
         database: The database.
         first: Id of the first run, or `ID:LABEL` for one of its settings.
         second: Id of the second run, or `ID:LABEL` for one of its settings.
-
-    Raises:
-        UsageError: There is no such setting, a run has no episodes, or only one of the runs is a training.
-        UnknownName: There is no such run.
-        CheckpointError: A run is damaged.
     """
     ours, theirs = compared_runs(database, first), compared_runs(database, second)
     if ours[0].run.has_episodes != theirs[0].run.has_episodes:
@@ -118,9 +109,6 @@ def compare(first: ComparedRun, second: ComparedRun) -> Row:
         - `settings`: every key whose two values differ, with both values. A value is None where the key is missing.
         - `results`: for each measure both values, the change, and the change's 95 % interval if it is known
         - `note`: why there is no ratio of times. Empty if there is a ratio.
-
-    Raises:
-        UsageError: A setting has no episodes.
     """
     settings = differences(_settings_of(first), _settings_of(second))
     if first.data is None or second.data is None:
@@ -189,16 +177,12 @@ def same_tokens(first: Study, second: Study) -> tuple[int, int]:
     """Return two counts: shared episodes with equal tokens, and all shared episodes.
 
     An episode is shared if both studies have an episode with the same label, task and seed.
-
-    Raises:
-        UsageError: A study has no episode.
     """
     shared = _tokens(first).merge(_tokens(second), on=["label", "task", "seed"])
     return int((shared["tokens_x"] == shared["tokens_y"]).sum()), len(shared)
 
 
 def _tokens(store: Study) -> pd.DataFrame:
-    """Return a row per episode: label, task, seed, and the tokens of all its decodes."""
     frame = store.frame()[["episode", "label", "task", "seed"]]
     decodes = store.decodes(frame["episode"].tolist(), ["tokens"]).to_pandas()  # `episode` is a position in the list
     tokens = decodes.groupby("episode")["tokens"].agg(lambda rows: tuple(map(tuple, rows)))

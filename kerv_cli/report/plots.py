@@ -162,7 +162,6 @@ def _tooltip(points: Sequence[Point]) -> list[alt.Tooltip]:
 
 
 def _faded(full: float) -> alt.When:
-    """Return the opacity of a point: 0.12 if the reader has clicked on another setting, and `full` otherwise."""
     return alt.when("picked == '' || picked == datum.setting").then(alt.value(full)).otherwise(alt.value(0.12))
 
 
@@ -303,7 +302,6 @@ def acceptance_figure(data: StudyData) -> alt.ConcatChart:
 
 
 def _best_step(log: pd.DataFrame) -> float:
-    """Return the training step of the best validation."""
     return float(log["step"].to_numpy()[int(log["score"].to_numpy().argmax())])
 
 
@@ -336,7 +334,6 @@ def curves_figure(log: pd.DataFrame) -> alt.ConcatChart:
 
 
 def _chart(panels: list[alt.LayerChart], across: int) -> alt.ConcatChart:
-    """Put panels side by side, `across` in a row. Add the style that all charts share, and the parameter `picked`."""
     chart = alt.concat(*panels, columns=across, spacing=28, config=_CONFIG)
     chart.params = [alt.param("picked", value="").param]  # `add_params` would copy the panels again and again
     return chart
@@ -362,9 +359,6 @@ def read_log(folder: Path) -> pd.DataFrame:
 
     Args:
         folder: Folder of the trained artifact.
-
-    Raises:
-        CheckpointError: The folder has no readable log of a training.
     """
     path = folder / "log.csv"
     try:
@@ -374,12 +368,7 @@ def read_log(folder: Path) -> pd.DataFrame:
 
 
 def save_curves(folder: Path) -> Path:
-    """Write `curves.png` into the folder of a trained artifact and return its path.
-
-    Raises:
-        CheckpointError: The folder has no readable log of a training.
-        StorageError: The disk is full or read-only.
-    """
+    """Write `curves.png` into the folder of a trained artifact and return its path."""
     path, log = folder / "curves.png", read_log(folder)
     note = f"{len(log)} validations of the averaged weights; dashed: the saved ones, step {_best_step(log):.0f}"
     write_if_changed(path, png(curves_figure(log), f"{folder.parent.name} {folder.name}", note))

@@ -70,10 +70,6 @@ class NamedProfile:
             tokens: N, number of tokens of the chunks to price.
             kinds: Kinds of costs that are needed, such as `verify`.
             setting: Label of the setting whose decodes are priced, for the message. If empty, no setting is named.
-
-        Raises:
-            UsageError: A cost is missing, or the costs are for shorter chunks. The message names what is missing and
-                the command that measures it.
         """
         command = f"kerv bench target={self.profile.about.get('target', 'TARGET')} tokens={tokens}"
         if lacks := self.profile.lacks(kinds):
@@ -92,9 +88,6 @@ def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfil
     Args:
         results: Results folder.
         names: Each name is a path, the name of a file in <results>/bench, or the name of a profile that kerv ships.
-
-    Raises:
-        UsageError: There is no such file, the file has no profile, or another version of kerv wrote it.
     """
     folders = (Path(results) / "bench", shipped_dir().parent / "bench")
     profiles = []

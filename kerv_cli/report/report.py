@@ -252,7 +252,7 @@ def study_parts(report: Report) -> dict[str, Any]:
         "absent": list(dict.fromkeys(f"{one.setting.label} on {one.task}" for one in data.absent)),
         "results": "" if results == "results" else f" results={shlex.quote(results)}",
         "main": MAIN,
-        "columns": note_of(rows),
+        "columns": note_of(rows, list(suite[0])[:MAIN]),
         "meanings": {name: text.format(study.baseline) for name, text in MEANINGS.items()},
         "shown": columns_shown(suite),
         "suite": suite,
@@ -309,5 +309,4 @@ def _films(data: StudyData) -> list[dict[str, Any]]:
 
 
 def _href(folder: Path, path: Path) -> str:
-    """Return the address of the file `path` for a link in a page, relative to the page's `folder`."""
     return quote(Path(os.path.relpath(path, folder)).as_posix())

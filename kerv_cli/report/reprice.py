@@ -76,10 +76,6 @@ def repriced(data: StudyData, profiles: Sequence[NamedProfile], lenient: bool = 
 
     Returns:
         One estimate per profile and setting. Settings that run no decoder are left out.
-
-    Raises:
-        UsageError: A profile lacks a cost that the study needs, or has costs for shorter chunks only. Or a setting has
-            no times, because its episodes ran in a batch.
     """
     if not profiles:
         return []
@@ -107,7 +103,6 @@ def repriced(data: StudyData, profiles: Sequence[NamedProfile], lenient: bool = 
 
 
 def _estimated(data: StudyData, works: Mapping[str, _LabelWork], profile: Profile) -> dict[Hashable, Measures]:
-    """Return the measures of every setting, by label. The times of the decodes are computed from a profile."""
     episodes = data.episodes
     priced = pd.concat([_priced(episodes[episodes["label"] == label], work, profile) for label, work in works.items()])
     pairs = paired(priced, data.references)
@@ -154,11 +149,7 @@ class _LabelWork(NamedTuple):
 
 
 def _work_of_label(data: StudyData, label: str) -> _LabelWork:
-    """Read which operations the decodes of a setting executed, in the order of its episodes.
-
-    Raises:
-        UsageError: The setting's episodes ran in a batch and have no times.
-    """
+    """Read which operations the decodes of a setting executed, in the order of its episodes."""
     if (batch := data.settings[label].batch) > 1:
         raise UsageError(
             f"setting '{label}' ran {batch} episodes at a time, without times: run it with rollout.batch=1"

@@ -101,11 +101,7 @@ class StudyData:
         return references_of(self.study.settings, self.study.baseline)
 
     def compared_with(self, label: str) -> StudyData:
-        """Return the study with the setting `label` as baseline. The tables are then named NAME_against_LABEL.
-
-        Raises:
-            UsageError: The study has no such setting.
-        """
+        """Return the study with the setting `label` as baseline. The tables are then named NAME_against_LABEL."""
         if label not in self.settings:
             raise UsageError(f"baseline={label}: '{self.study.name}' has the settings {', '.join(self.labels)}")
         against = f"_against_{re.sub(r'[^A-Za-z0-9.]+', '_', label)}"
@@ -220,12 +216,10 @@ def references_of(settings: Sequence[Setting], baseline: str) -> dict[str, str]:
 
 
 def _conditions_of(setting: Setting) -> str:
-    """Return the stress and the settings `rollout.*` of a setting as JSON text, to compare conditions."""
     return json.dumps([stress_of(setting.settings), setting.settings["rollout"]], sort_keys=True)
 
 
 def _methods_of(setting: Setting) -> str:
-    """Return as JSON text what determines a setting's results, except stress and the settings `rollout.*`."""
     world = without(setting.settings["world"], {"stress"})
     others = without(setting.settings, (NOT_DETERMINING - {"policy"}) | {"world", "rollout"})
     return json.dumps([world, others, dict(setting.identity)], sort_keys=True)
@@ -237,9 +231,6 @@ def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyDa
     Args:
         study: The study. If `wanted` is None, only its name matters: its settings and episodes are read again.
         wanted: Episodes to read. Settings without any of these episodes are left out. If None, read all episodes.
-
-    Raises:
-        UsageError: There is no such study, or none of its episodes is stored.
     """
     if wanted is None:
         study = study.load()
@@ -272,7 +263,6 @@ def _with_new_seeds(episodes: pd.DataFrame) -> list[pd.DataFrame]:
 
 
 def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
-    """Add the columns difficulty, device, dtype and threads. Turn initial states into tuples, which can be compared."""
     runtimes = pd.DataFrame([one.settings["runtime"] for one in study.settings], study.labels, list(RUNTIME))
     difficulty = episodes["task"].map(functools.cache(difficulty_of))
     states = episodes["initial_state"].map(tuple)  # tuples can be compared
@@ -403,7 +393,6 @@ def passing(rows: Iterable[Result], loss: float) -> list[Result]:
 
 
 def _series_of(setting: Setting, axis: str) -> str:
-    """Return a name that settings share if they differ only along the study's axis."""
     words = [setting.name.rstrip(", ")]
     for key, value in setting.varies.items():
         if key != axis:
@@ -437,7 +426,6 @@ def differences(first: Row, second: Row) -> list[Row]:
 
 
 def _joined(values: Iterable[object]) -> str:
-    """Return all different values except None as one text, separated by semicolons."""
     return ";".join(dict.fromkeys(str(value) for value in dict.fromkeys(values) if value is not None))
 
 

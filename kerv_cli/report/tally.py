@@ -120,7 +120,6 @@ def rates(reached: np.ndarray, accepted: np.ndarray) -> list[float | None]:
 
 
 def _sum(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Add two arrays of counts. The shorter array is extended with zeros."""
     total = np.zeros(max(len(first), len(second)), int)
     for counts in (first, second):
         total[: len(counts)] += counts

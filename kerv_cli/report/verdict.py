@@ -230,7 +230,6 @@ def unsolved(baseline: str, success: float) -> str:
 
 
 def _speed(choice: Choice) -> str:
-    """Return the clause that says how fast the chosen setting is."""
     if not is_number(choice.episode_speedup.value):
         return "; its speed was not measured"
     shown = "and is faster" if choice.is_shown else "but is not shown to be faster"
@@ -238,7 +237,6 @@ def _speed(choice: Choice) -> str:
 
 
 def _factor(choice: Choice) -> str:
-    """Return the speed of the chosen setting, or of the candidate, with its interval."""
     speed = choice.episode_speedup
     runs = f"of {choice.runs} runs" if choice.runs > 2 else "of this run"
     interval = f"({speed.low:.2f}–{speed.high:.2f} {runs})" if is_number(speed.low) else f"({runs})"

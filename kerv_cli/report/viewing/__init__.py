@@ -18,10 +18,6 @@ def save_recording(record: EpisodeRecord, path: Path, method: str) -> Path:
         record: The episode. Without frames, the recording shows no camera.
         path: The .rrd file. Its folder is created.
         method: Name of the method. Recordings of one method share their layout in the viewer.
-
-    Raises:
-        KervError: Rerun is not installed.
-        StorageError: The disk is full or read-only, or the folder may not be written to.
     """
     if not has_rerun():
         raise KervError(NO_RERUN)

@@ -192,7 +192,6 @@ def _log_tokens(log: _Log, record: EpisodeRecord) -> None:
 
 
 def _part(name: str) -> str:
-    """Return the name with every character that Rerun does not allow in a path replaced by an underscore."""
     return re.sub(r"\W+", "_", name, flags=re.ASCII)
 
 

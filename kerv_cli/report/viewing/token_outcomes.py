@@ -84,7 +84,6 @@ def token_names(decodes: Sequence[DecodeRecord], dofs: Sequence[str]) -> Sequenc
 
 
 def _is_coded(decode: DecodeRecord, dofs: int) -> bool:
-    """Return whether the tokens are shown without DoFs, as `token_names` chose."""
     return decode.actions.ndim == 2 and decode.actions.shape[1] != dofs
 
 
@@ -216,7 +215,6 @@ def summary(record: EpisodeRecord, method: str) -> str:
 
 
 def _text(value: object) -> str:
-    """Return a value as text. The text is empty if the value is None."""
     return "" if value is None else str(value)
 
 

@@ -46,9 +46,6 @@ def find_recordings(paths: Iterable[Path]) -> list[Path]:
 
     Args:
         paths: .rrd files, and folders to search.
-
-    Raises:
-        UsageError: A path does not exist or is neither a recording nor a folder, or no recording was found.
     """
     paths, found = [Path(path).expanduser() for path in paths], set[Path]()
     for path in paths:
@@ -79,9 +76,6 @@ def open_recording(paths: Sequence[Path]) -> str:
 
     Returns:
         A sentence about what was opened. If this machine has no display, the commands to type on another machine.
-
-    Raises:
-        KervError: A recording is damaged, Rerun is not installed, or the viewer did not start.
     """
     chosen = paths[:MOST_OPENED]
     for path in chosen:
@@ -99,7 +93,6 @@ def open_recording(paths: Sequence[Path]) -> str:
 
 
 def _own_name(path: Path) -> str:
-    """Return a file name that no other run's recording has: the run's name, then the recording's file name."""
     return f"{path.parent.parent.name}-{path.name}" if path.parent.name == "rollouts" else path.name
 
 
@@ -109,11 +102,7 @@ def viewer_command() -> list[str]:
 
 
 def _start(command: list[str]) -> None:
-    """Start the viewer in a process of its own.
-
-    Raises:
-        KervError: The viewer cannot be started, or ends within two seconds.
-    """
+    """Start the viewer in a process of its own."""
     with tempfile.TemporaryFile() as log:
         try:
             viewer = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True)
@@ -130,11 +119,7 @@ def _start(command: list[str]) -> None:
 
 
 def read_chunks(path: Path) -> tuple[RrdReader, list[Chunk]]:
-    """Read a recording. Return Rerun's reader and all data chunks of the file.
-
-    Raises:
-        KervError: The file is missing, damaged, or holds no recording. Or Rerun is not installed.
-    """
+    """Read a recording. Return Rerun's reader and all data chunks of the file."""
     if not has_rerun():
         raise KervError(NO_RERUN)
     from rerun.chunk import RrdReader
@@ -172,11 +157,7 @@ class Film:
 
 
 def film_of(path: Path) -> Film:
-    """Read the images of a recording. The latest four recordings are kept in memory.
-
-    Raises:
-        KervError: The recording is missing or damaged, or Rerun is not installed.
-    """
+    """Read the images of a recording. The latest four recordings are kept in memory."""
     changed = path.stat().st_mtime_ns if path.exists() else 0
     return _read(path, changed)
 
