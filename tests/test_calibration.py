@@ -144,7 +144,7 @@ def own(with_datastore, tmp_path):
 
 
 def words(results: Path, *overrides: str) -> list[str]:
-    usual = {"task": "reach,drawer-close", "demos": "few", "decodes": "0"}
+    usual = {"task": "reach,drawer-close", "demos": "few", "decodes": "0", "replace": "true"}
     usual |= {"policy.target": "nano-state", "results": str(results)}
     given = dict(override.split("=", 1) for override in overrides if "=" in override)
     return [f"{key}={value}" for key, value in {**usual, **given}.items()]
