@@ -10,6 +10,8 @@ from command import kerv
 
 from kerv_cli.base import registry
 from kerv_cli.base.registry import Part
+from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.chunk import Chunk
 
 pytestmark = pytest.mark.usefixtures("quick_report")
 
@@ -29,9 +31,20 @@ def own_parts() -> dict[str, dict[str, Part]]:
     }
 
 
-def test_the_worked_example_is_the_file():
+@pytest.mark.parametrize("name", ["own_threshold.py", "own_repeat.py"])
+def test_the_worked_example_is_the_file(name):
     page = (ROOT / "docs/extending.md").read_text(encoding="utf-8")
-    assert f"```python\n{(EXAMPLES / 'own_threshold.py').read_text(encoding='utf-8')}```" in page
+    assert f"```python\n{(EXAMPLES / name).read_text(encoding='utf-8')}```" in page
+
+
+def test_every_field_of_an_observation_and_a_chunk_that_the_page_names_exists():
+    page = (ROOT / "docs/extending.md").read_text(encoding="utf-8")
+    for part, named in ((Observation, "an `Observation`"), (Chunk, "a `Chunk`")):
+        rows = page.split(f"of {named}")[1].split("\n\n")[1].splitlines()[2:]
+        fields = {name for row in rows for name in re.findall(r"`([a-z]+)", row.split("|")[1])}
+        known = {*vars(part), *part.__dataclass_fields__}
+        assert fields <= known
+    assert set(Observation.__dataclass_fields__) == {"proprioception", "state", "instruction", "images", "readings"}
 
 
 def test_every_kind_is_named_with_its_files():
