@@ -19,6 +19,7 @@ from mock_target import SEVEN
 from test_calibration import write_dataset
 
 from kerv_cli.base.errors import CheckpointError, StorageError, UnknownName, UsageError
+from kerv_cli.base.manifests import DIGEST
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decisions import ROOT, TokenTree
 from kerv_cli.lab.database import Database
@@ -265,6 +266,7 @@ Change = Callable[[dict[str, Any]], None]
 def rewrite(folder: Path, change: Change) -> None:
     manifest = json.loads((folder / "manifest.json").read_text())
     change(manifest)
+    del manifest[DIGEST]  # as one that was made so, not damaged later
     (folder / "manifest.json").write_text(json.dumps(manifest))
 
 
