@@ -113,10 +113,6 @@ class TargetDescription(Description):
             environment: Name of the environment, for the error message.
             actions: Action space of the environment.
             size: Pixels per side of the images that the environment gives.
-
-        Raises:
-            UsageError: The target was trained on images of a different size.
-            CheckpointError: The target has a different action space.
         """
         trained = self.settings.get("image_size", size)
         if self.cameras and size != trained:
@@ -129,9 +125,6 @@ class TargetDescription(Description):
         Args:
             what: The setting that requires decoding token by token, text for the error message.
             why: Why the setting requires this, text for the error message.
-
-        Raises:
-            UsageError: The target decodes all tokens at once.
         """
         if self.parallel:
             raise UsageError(f"{what}: the target decodes all tokens at once, {why}; choose one that is autoregressive")
@@ -147,9 +140,6 @@ def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, 
         path: The file.
         tensors: The tensors, by name.
         metadata: Texts to store in the file, by name. None if there are no texts.
-
-    Raises:
-        StorageError: The disk is full or read-only, or permission is missing.
     """
     from safetensors.torch import save
 
@@ -162,9 +152,6 @@ def load_tensors(path: Path, what: str) -> dict[str, Tensor]:
     Args:
         path: The file.
         what: What the file contains, text for the error message.
-
-    Raises:
-        CheckpointError: The file is missing or damaged, or contains NaN or infinity.
     """
     import torch
     from safetensors import SafetensorError
@@ -279,10 +266,6 @@ def read_description(folder: Path, kind: str, schema: type[T]) -> T:
         folder: Folder of the artifact.
         kind: Kind of artifact, such as `drafter`.
         schema: Dataclass of the description.
-
-    Raises:
-        CheckpointError: The description or the weights are missing, damaged or of another version of kerv, or they do
-            not belong together.
     """
     description = described(folder, kind, schema)
     check_weights(folder, kind, description.sha256)
@@ -296,9 +279,6 @@ def described(folder: Path, kind: str, schema: type[T]) -> T:
         folder: Folder of the artifact.
         kind: Kind of artifact, such as `drafter`.
         schema: Dataclass of the description.
-
-    Raises:
-        CheckpointError: The description is missing, damaged or of another version of kerv.
     """
     path = folder / f"{kind}.json"
     if not path.is_file():
@@ -316,9 +296,6 @@ def check_weights(folder: Path, kind: str, sha256: str) -> None:
         folder: Folder of the artifact.
         kind: Kind of artifact, for the error message.
         sha256: The hash in the description.
-
-    Raises:
-        CheckpointError: The weights are missing, or have a different hash.
     """
     weights = folder / WEIGHTS
     if not weights.is_file():
@@ -334,9 +311,6 @@ def load_state(module: nn.Module, folder: Path, kind: str) -> None:
         module: The module.
         folder: Folder with `model.safetensors`.
         kind: Kind of artifact, for the error message.
-
-    Raises:
-        CheckpointError: The weights are missing, damaged, or do not fit the module.
     """
     try:
         module.load_state_dict(expanded(load_tensors(folder / WEIGHTS, kind)))
@@ -350,10 +324,6 @@ def read_target(folder: Path) -> TargetDescription:
 
     A family of targets whose weights are not in the target's folder registers its own check
     (`TargetPart.check_weights`).
-
-    Raises:
-        CheckpointError: The description or the weights are missing, damaged or of another version of kerv, or they do
-            not belong together.
     """
     description = described(folder, "target", TargetDescription)
     family = TargetPart.every().get(description.family)
@@ -374,10 +344,6 @@ def load_target(folder: Path, device: str = "cpu", dtype: torch.dtype | None = N
 
     Returns:
         The target and its description.
-
-    Raises:
-        CheckpointError: The target is missing or damaged.
-        UnknownName: The target's family is not registered, for example because a plugin is not installed.
     """
     import torch
 

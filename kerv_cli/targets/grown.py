@@ -56,9 +56,6 @@ def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
         stack: A trunk or a drafter. It is changed in place.
         shape: Width, heads and hidden units of the new layers.
         layers: Number of new layers.
-
-    Raises:
-        UsageError: The new shape is smaller, or the channels of a new head are no multiple of those of an old head.
     """
     old: list[Any] = [copy.deepcopy(layer).float() for layer in stack.layers]
     stack.compiled = None
@@ -113,20 +110,12 @@ def _grown_layer(old: Layer | None, stack: LayerStack, shape: GrowSettings, gene
 
 
 def recipe_of(description: TargetDescription) -> Recipe:
-    """Return the recipe in a grown target's description.
-
-    Raises:
-        CheckpointError: The description contains no recipe.
-    """
+    """Return the recipe in a grown target's description."""
     return read(Recipe, description.settings.get("grown", {}), "a grown target's recipe")
 
 
 def check_weights(folder: Path, description: TargetDescription) -> None:
-    """Check that the weights of the original policy, which a grown target enlarges, have not changed.
-
-    Raises:
-        CheckpointError: The policy is missing, or its weights have changed.
-    """
+    """Check that the weights of the original policy, which a grown target enlarges, have not changed."""
     recipe = recipe_of(description)
     if checkpoint.read_target(Path(recipe.base)).sha256 != recipe.sha256:
         raise CheckpointError(f"{folder} grows from {recipe.base}, whose weights are others now: build it again")
@@ -140,9 +129,6 @@ def build(folder: Path, description: TargetDescription, device: str, dtype: torc
         description: The content of its `target.json`, which holds the recipe.
         device: Device to load the target to.
         dtype: Number format to convert the weights to.
-
-    Raises:
-        CheckpointError: The policy is missing, or the weights do not fit it.
     """
     recipe = recipe_of(description)
     base = Path(recipe.base)
@@ -173,10 +159,6 @@ def grow(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
 
     Returns:
         The target's folder, and numbers to print, each with its name, such as the number of weights.
-
-    Raises:
-        UsageError: There is no such policy, it is not a compact target, or it is larger than the new shape.
-        CheckpointError: The policy is damaged.
     """
     base = find_target(settings.results, settings.base).resolve()
     description = checkpoint.read_target(base)

@@ -96,10 +96,6 @@ def read_observations(
         space: Observation space of the demonstrations.
         words: The policy's vocabulary.
         chosen: Which of these observations to return, as indices among them or as a slice.
-
-    Raises:
-        CheckpointError: The images have a different size than the policy takes.
-        UsageError: The instruction has more words than the policy takes.
     """
     sees, frames = settings.observation == "vision", None
     steps = observed_steps(episode, sees)[chosen]
@@ -125,9 +121,6 @@ def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarr
 
     Returns:
         (n, H, D) float32, environment units.
-
-    Raises:
-        CheckpointError: The recording holds fewer than H − 1 actions after the last control step.
     """
     check_tail(episode, chunk, f"chunks of {chunk}")
     return episode.labels[steps[:, None] + np.arange(chunk)]
@@ -153,10 +146,6 @@ def observations_of(
         episode: The demonstration.
         steps: (n,) control steps.
         space: Observation space of the demonstrations.
-
-    Raises:
-        CheckpointError: The target reads images, but a step has no image, or images have a different size than the
-            target takes.
     """
     frames: Any = [None] * len(steps)
     if target.cameras:
@@ -200,9 +189,6 @@ def check_tail(episode: DemoEpisode, steps: int, use: str) -> None:
         episode: The episode.
         steps: Number of expert actions that are needed from the last control step on.
         use: What the actions are needed for, text for the error message.
-
-    Raises:
-        CheckpointError: The recording holds fewer than `steps` − 1 actions after the last control step.
     """
     tail = len(episode.labels) - episode.steps
     if tail < steps - 1:
@@ -218,9 +204,6 @@ def check_frames(episode: DemoEpisode, size: int) -> None:
     Args:
         episode: The episode.
         size: Pixels per side of a camera view. An image may consist of several views side by side.
-
-    Raises:
-        CheckpointError: The images have a different size.
     """
     height, width = episode.frames.shape[1:3]
     if height != size or width % size:
@@ -242,9 +225,6 @@ def split(samples: S, share: float) -> tuple[S, S]:
     Args:
         samples: Samples with a tensor `episodes`, the index of each sample's episode.
         share: Share of episodes to hold out, above 0 and at most 0.5.
-
-    Raises:
-        CheckpointError: There is only one episode, which cannot be in both parts.
     """
     episodes: Tensor = getattr(samples, "episodes")  # noqa: B009
     count = int(episodes.max()) + 1

@@ -63,10 +63,6 @@ def spec_of(task: str) -> EnvironmentSpec:
 
     Args:
         task: Full or short name of the task.
-
-    Raises:
-        UnknownName: No environment has the task.
-        UsageError: Several environments have the task.
     """
     owners = [spec for spec in specs().values() if spec.full_name(task) is not None]
     if not owners:
@@ -81,10 +77,6 @@ def instruction_of(task: str) -> str:
 
     Args:
         task: Full or short name of a task of any environment.
-
-    Raises:
-        UnknownName: No environment has the task.
-        UsageError: Several environments have the task.
     """
     return spec_of(task).task(task).instruction
 
@@ -94,10 +86,6 @@ def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
 
     Args:
         names: Full or short names of tasks, and names of suites such as `MT10` or `mt50`.
-
-    Raises:
-        UnknownName: A name is neither a task nor a suite.
-        UsageError: There is no name, or the tasks belong to several environments, whose action spaces may differ.
     """
     if not names:
         raise UsageError("name at least one task or suite: task=NAME")

@@ -91,10 +91,6 @@ def choose_backend() -> str:
     If the environment variable `MUJOCO_GL` is set, it decides. Otherwise EGL and then OSMesa are tried, each in its own
     process, so that a broken driver cannot crash kerv. Worker processes inherit the choice through `MUJOCO_GL` and
     `PYOPENGL_PLATFORM`.
-
-    Raises:
-        RenderingUnavailable: No backend can draw here, `MUJOCO_GL` switches drawing off, or mujoco was already imported
-            without an off-screen backend.
     """
     backend, error = find_backend()
     if error:
@@ -156,9 +152,6 @@ class Camera:
             model: Model to draw.
             config: View and size of the image.
             upside_down: Whether the raw image must be rotated by 180 degrees.
-
-        Raises:
-            RenderingUnavailable: The OpenGL backend cannot open a context.
         """
         backend = choose_backend()
         import mujoco

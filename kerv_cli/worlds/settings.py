@@ -54,10 +54,6 @@ class StressSettings:
 
         Args:
             prefix: Key of these settings on the command line, with a dot at its end, for the error message.
-
-        Raises:
-            UnknownName: There is no such kind.
-            UsageError: There is a level without a kind.
         """
         if self.kind != "none":  # else the kinds, which import numpy, are not loaded
             find("stress", self.kind, f"{prefix}kind")

@@ -35,9 +35,6 @@ def views_of(name: str) -> list[View]:
     Args:
         name: One or more views joined by `+`. A view is NAME or NAME:DEGREES, where DEGREES is its vertical field of
             view. An empty name means one view of the environment's first camera.
-
-    Raises:
-        UsageError: A view has no camera or an impossible field of view.
     """
     views = [] if name else [View("", "", None)]
     for part in name.split(VIEWS) if name else ():

@@ -150,11 +150,7 @@ class WordTokenizer:
         return {word: i + 2 for i, word in enumerate(self.words)}
 
     def encode(self, sentence: str, length: int) -> list[int]:
-        """Return exactly `length` ids for a sentence, with padding at the end.
-
-        Raises:
-            UsageError: The sentence has more than `length` words. It is not cut, because a decisive word could be lost.
-        """
+        """Return exactly `length` ids for a sentence, with padding at the end."""
         ids = [self.index.get(word, UNKNOWN) for word in sentence.lower().split()]
         if len(ids) > length:
             raise UsageError(f"instruction '{sentence}' has {len(ids)} words, the policy takes {length}: shorten it")

@@ -304,9 +304,6 @@ class Program:
             results: (times, 1, B) float32, or (levels, 4, top_k²) for `grow`. It is filled with the results of each
                 execution. If None, execute once.
             end: Stop after an execution whose result for the first sequence is this token. If None, never stop early.
-
-        Raises:
-            IndexError: The cache has too little room for the new tokens.
         """
         where = np.zeros(1, np.int64) if positions is None else positions.numpy()
         rows, tokens = inputs[0].numel() // self.places[0][1], len(where)
@@ -457,9 +454,6 @@ def load_compiled(module: M, folder: Path, kind: str, device: str | torch.device
         kind: Kind of artifact, such as `drafter`, for error messages.
         device: Device to move the module to.
         dtype: Number format to convert the weights to.
-
-    Raises:
-        CheckpointError: The weights are missing, damaged, or do not fit the module.
     """
     load_state(module, folder, kind)
     module = module.to(device=device, dtype=dtype).eval().requires_grad_(False)

@@ -177,13 +177,7 @@ class CompactTarget(Compilable):
         return self.head.weight.dtype
 
     def inputs(self, observation: Observation) -> Inputs:
-        """Return an observation as tensors on this target's device, a batch of one.
-
-        Raises:
-            CheckpointError: Proprioception, state or image has a different size than in training, or the image is
-                missing.
-            UsageError: The instruction has too many words.
-        """
+        """Return an observation as tensors on this target's device, a batch of one."""
         proprioception = upload(np.asarray(observation.proprioception, dtype=np.float32), self.device)[None]
         state = upload(np.asarray(observation.state, dtype=np.float32), self.device)[None]
         given = proprioception.shape[1], state.shape[1]
@@ -208,21 +202,11 @@ class CompactTarget(Compilable):
         return Inputs(images, proprioception, state, upload([words], self.device))
 
     def encode(self, observation: Observation) -> Tensor:
-        """Encode an observation as a prompt (1, P, E).
-
-        Raises:
-            CheckpointError: The observation does not fit the target, see `inputs`.
-            UsageError: The instruction has too many words.
-        """
+        """Encode an observation as a prompt (1, P, E)."""
         return self.encode_batch(self.inputs(observation))[0]
 
     def encode_many(self, observations: Sequence[Observation]) -> Tensor:
-        """Encode B observations as prompts (B, P, E).
-
-        Raises:
-            CheckpointError: An observation does not fit the target, see `inputs`.
-            UsageError: An instruction has too many words.
-        """
+        """Encode B observations as prompts (B, P, E)."""
         columns: Any = zip(*(vars(inputs).values() for inputs in map(self.inputs, observations)), strict=True)
         joined: Any = (None if column[0] is None else torch.cat(column) for column in columns)
         return self.encode_batch(Inputs(*joined))[0]
@@ -430,9 +414,6 @@ def build(folder: Path, description: TargetDescription, device: str, dtype: torc
         description: The content of the target's `target.json`.
         device: Device to load the target to.
         dtype: Number format to convert the weights to.
-
-    Raises:
-        CheckpointError: The description does not belong to a compact target, or the weights do not fit it.
     """
     settings = read(TargetSettings, description.settings, str(folder / "target.json"))
     camera = description.cameras[0] if description.cameras else ""

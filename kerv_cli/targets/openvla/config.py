@@ -123,11 +123,7 @@ class Shape:
 
 
 def read_shape(folder: Path) -> Shape:
-    """Read the shapes from a checkpoint's `config.json`.
-
-    Raises:
-        CheckpointError: The file is missing, or does not describe an OpenVLA with two vision towers and a Llama.
-    """
+    """Read the shapes from a checkpoint's `config.json`."""
     path, value = folder / CONFIG, read_config(folder)
     text = value.get("text_config")
     if not isinstance(text, Mapping) or text.get("model_type", "llama") != "llama" or text.get("rope_scaling"):
@@ -143,11 +139,7 @@ def read_shape(folder: Path) -> Shape:
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """Return the content of a checkpoint's `config.json`.
-
-    Raises:
-        CheckpointError: The file is missing, or belongs to a different type of model.
-    """
+    """Return the content of a checkpoint's `config.json`."""
     path = folder / CONFIG
     if not path.is_file():
         raise CheckpointError(f"no {CONFIG} in {folder}: name the folder of a Hugging Face OpenVLA checkpoint")
@@ -185,11 +177,6 @@ def read_statistics(folder: Path, name: str | None) -> tuple[str, Bounds]:
 
     Returns:
         The name of the data set and its statistics.
-
-    Raises:
-        UsageError: No name is given, but the checkpoint has statistics of several data sets.
-        UnknownName: The checkpoint has no statistics of this data set.
-        CheckpointError: The checkpoint has no statistics, or they are damaged.
     """
     path = folder / STATISTICS
     statistics = read_json(path) if path.is_file() else read_config(folder).get("norm_stats")
@@ -214,9 +201,6 @@ def action_space(shape: Shape, bounds: Bounds, like: ActionSpace | None, control
         like: Action space of an environment, from which names, groups, strict DoFs and control rate are copied. If
             None, the space has OpenVLA's seven DoFs.
         control_hz: Control steps per second if `like` is None.
-
-    Raises:
-        CheckpointError: The statistics have a different number of DoFs, or a DoF's `low` is not below its `high`.
     """
     from kerv_cli.base.spaces import ActionSpace, Group
 

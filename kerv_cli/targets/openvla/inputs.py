@@ -53,11 +53,7 @@ class _Preprocessor:
 
 
 def read_normalisations(folder: Path) -> tuple[Normalisation, Normalisation]:
-    """Read the normalisation for each tower from `preprocessor_config.json`. Without that file return the defaults.
-
-    Raises:
-        CheckpointError: The file is damaged, or requires a different way of resizing images.
-    """
+    """Read the normalisation for each tower from `preprocessor_config.json`. Without that file return the defaults."""
     path = folder / PREPROCESSOR
     found = read(_Preprocessor, read_mapping(path) if path.is_file() else {}, str(path), tolerant=True)
     if found.image_resize_strategy != RESIZE:
@@ -148,10 +144,6 @@ class Prompter:
             shape: Shapes of the checkpoint.
             form: Version of the prompt, a key of `PROMPTS`.
             limit: Maximum number of ids in a prompt.
-
-        Raises:
-            CheckpointError: The tokenizer is missing, damaged, or belongs to a different model.
-            KervError: The Python package `tokenizers` is not installed.
         """
         path = folder / TOKENIZER
         if not path.is_file():
@@ -173,11 +165,7 @@ class Prompter:
             )
 
     def ids(self, instruction: str) -> list[int]:
-        """Return the ids of the prompt for an instruction: begin of sequence, the text, a word boundary.
-
-        Raises:
-            UsageError: The prompt has too many ids. It is not cut, because a decisive word could be lost.
-        """
+        """Return the ids of the prompt for an instruction: begin of sequence, the text, a word boundary."""
         ids: list[Any] = self.tokenizer.encode(self.text.format(instruction.lower())).ids
         if ids[:1] != [self.begin]:
             ids = [self.begin, *ids]

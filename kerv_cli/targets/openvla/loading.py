@@ -74,11 +74,7 @@ def _open_tensors(path: Path) -> Iterator[Any]:
 
 
 def open_shards(folder: Path) -> Shards:
-    """Open the safetensors files in a folder. Only their headers are read.
-
-    Raises:
-        CheckpointError: The folder has no such files, or only pickled weights, or a file is damaged.
-    """
+    """Open the safetensors files in a folder. Only their headers are read."""
     files = sorted(folder.glob("[!.]*.safetensors"))
     if not files:
         pickled = [path.name for path in visible(folder) if path.suffix in PICKLED]
@@ -103,9 +99,6 @@ def check_layout(shapes: Mapping[str, Sizes], expected: Mapping[str, Sizes], whe
         shapes: Shape of each tensor in the checkpoint, by name.
         expected: Shape of each expected tensor, by name.
         where: Folder of the checkpoint, for the error message.
-
-    Raises:
-        CheckpointError: Tensors are missing, unknown or have a wrong shape. The message names up to three of each kind.
     """
     missing, unknown = [n for n in expected if n not in shapes], [n for n in shapes if n not in expected]
     reshaped = [f"{n} {shapes[n]}, not {size}" for n, size in expected.items() if shapes.get(n, size) != size]
@@ -137,11 +130,7 @@ def sizes_of(module: nn.Module) -> dict[str, Sizes]:
 
 
 def open_checked(folder: Path, shape: Shape) -> Shards:
-    """Open the safetensors files in a folder, and check that they have the tensors of this shape.
-
-    Raises:
-        CheckpointError: Files are missing or damaged, or tensors are missing, unknown or have a wrong shape.
-    """
+    """Open the safetensors files in a folder, and check that they have the tensors of this shape."""
     shards = open_shards(folder)
     check_layout({n: s for n, s in shards.shapes.items() if not is_unread(n, shape)}, layout(shape), folder)
     return shards
@@ -156,9 +145,6 @@ def load_model(folder: Path, shape: Shape, device: str, dtype: torch.dtype, int8
         device: Device to load the model to.
         dtype: Number format to convert the weights to.
         int8: Whether to convert the layers of the language model to one byte per weight.
-
-    Raises:
-        CheckpointError: Files are missing or damaged, or tensors are missing, unknown or have a wrong shape.
     """
     shards = open_checked(folder, shape)
     with torch.device("meta"):
@@ -177,9 +163,6 @@ def check_finite(shards: Shards) -> int:
 
     Returns:
         The number of weights.
-
-    Raises:
-        CheckpointError: A tensor contains NaN or infinity.
     """
     count = 0
     for name, tensor in shards.items():

@@ -97,12 +97,7 @@ class OpenVLATarget:
         return torch.cat([prompt[:, self.segments[name]].mean(1) for name in ("vision", "instruction")], -1)
 
     def encode(self, observation: Observation) -> Tensor:
-        """Encode an observation as a prompt (1, P, E).
-
-        Raises:
-            CheckpointError: The image of the camera is missing.
-            UsageError: The instruction is too long.
-        """
+        """Encode an observation as a prompt (1, P, E)."""
         camera = self.cameras[0]
         if camera not in observation.images:
             raise CheckpointError(f"the target sees camera '{camera}', whose image was not drawn")
@@ -148,20 +143,12 @@ def build(folder: Path, description: TargetDescription, device: str, dtype: torc
         description: The content of the target's `target.json`.
         device: Device to load the target to.
         dtype: Number format to convert the weights to.
-
-    Raises:
-        CheckpointError: The description does not belong to an OpenVLA target, or the checkpoint is missing or damaged.
-        KervError: The Python package `tokenizers` is not installed.
     """
     return OpenVLATarget(read_settings(folder, description), description, device, dtype)
 
 
 def read_settings(folder: Path, description: TargetDescription) -> OpenVLASettings:
-    """Return the settings in a target's description.
-
-    Raises:
-        CheckpointError: The settings are not those of an OpenVLA target, or the number of cameras is not one.
-    """
+    """Return the settings in a target's description."""
     path = str(folder / "target.json")
     if len(description.cameras) != 1:
         raise CheckpointError(f"{path} names {len(description.cameras)} cameras: OpenVLA sees one")
@@ -172,9 +159,6 @@ def check_weights(folder: Path, description: TargetDescription) -> None:
     """Check that the checkpoint's files still have the names and sizes that they had when the target was built.
 
     The files are not hashed, because 15 GB would take too long.
-
-    Raises:
-        CheckpointError: The folder or a file is missing, or a file is new or has a different size.
     """
     settings = read_settings(folder, description)
     source = Path(settings.checkpoint)
@@ -193,13 +177,6 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
 
     Returns:
         The target's folder, and numbers to print, each with its name, such as the number of parameters.
-
-    Raises:
-        UsageError: No checkpoint is named, it has statistics of several data sets and none is chosen, or `check` is
-            set and transformers is not installed.
-        UnknownName: The chosen statistics or the environment do not exist.
-        CheckpointError: The checkpoint is incomplete, damaged, pickled, or of a different model.
-        KervError: The Python package `tokenizers` is not installed.
     """
     if not settings.checkpoint:
         raise UsageError("checkpoint=DIR: name the folder of a Hugging Face OpenVLA checkpoint")

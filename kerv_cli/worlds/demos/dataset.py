@@ -131,11 +131,7 @@ def register_recorded(
 
 
 def check_recorded(name: str) -> None:
-    """Check that imported data can be registered as an environment with this name.
-
-    Raises:
-        UsageError: A registered environment that is no imported data has this name.
-    """
+    """Check that imported data can be registered as an environment with this name."""
     part = EnvironmentPart.every().get(name)
     if part is not None and part.module != __name__:
         raise UsageError(
@@ -234,9 +230,6 @@ class DemoDataset:
 
         Args:
             path: The dataset's folder.
-
-        Raises:
-            CheckpointError: There is no dataset, its recording is unfinished, or a file is damaged.
         """
         file = path / "manifest.json"
         if not file.exists():
@@ -269,9 +262,6 @@ class DemoDataset:
         Returns:
             A dataset with all episodes, part by part. Its manifest is the first part's, with the tasks of all parts and
             a hash over the hashes of the parts.
-
-        Raises:
-            CheckpointError: The parts have different environments, spaces or cameras.
         """
         if len(parts) == 1:
             return parts[0]
@@ -293,11 +283,7 @@ class DemoDataset:
         return [index for index, entry in enumerate(self.episodes) if entry.task in tasks]
 
     def load(self, index: int) -> DemoEpisode:
-        """Read the episode at position `index` in `episodes`.
-
-        Raises:
-            CheckpointError: The file has changed since it was recorded.
-        """
+        """Read the episode at position `index` in `episodes`."""
         entry, path = self.episodes[index], self.episodes[index].path
         if sha256_of(path) != entry.sha256:
             raise CheckpointError(f"{path} changed since it was recorded: move it aside and run 'kerv demos' again")

@@ -85,10 +85,6 @@ def save_episode(path: Path, episode: DemoEpisode, level: int = 6) -> None:
         episode: The episode.
         level: Compression of the images, from 1 (five times as fast, 7 % more bytes) to 9. Equal recordings must have
             equal bytes, so recordings always use the default.
-
-    Raises:
-        StorageError: Writing failed.
-        ValueError: The images have different sizes.
     """
     with (
         atomic_path(path) as temporary,
@@ -133,11 +129,7 @@ def save_episode(path: Path, episode: DemoEpisode, level: int = 6) -> None:
 
 
 def load_episode(path: Path) -> DemoEpisode:
-    """Read an episode from a file.
-
-    Raises:
-        CheckpointError: The file is missing, damaged or of another format.
-    """
+    """Read an episode from a file."""
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}

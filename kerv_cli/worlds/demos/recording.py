@@ -179,12 +179,6 @@ def record(
 
     Returns:
         The manifest, as written to `out/manifest.json`.
-
-    Raises:
-        UsageError: `out` holds demonstrations of another configuration, or the simulator is not installed.
-        RenderingUnavailable: This machine cannot draw images.
-        StorageError: Writing failed.
-        KervError: The expert of a task never succeeded.
     """
     config.spec.check_installed()
     choose_backend()
@@ -261,9 +255,6 @@ def check_recording(config: DemoConfig, out: Path) -> dict[str, Any]:
 
     Returns:
         The manifest's fields that are known before the recording, as JSON values.
-
-    Raises:
-        UsageError: The folder holds demonstrations of another configuration.
     """
 
     def flat(one: dict[str, Any]) -> dict[str, Any]:
@@ -288,11 +279,7 @@ _Outcomes = dict[int, EpisodeEntry | None]  # seed -> the manifest's entry, None
 def _run_jobs(
     config: DemoConfig, out: Path, jobs: Sequence[tuple[str, range]], make_actor: MakeActor | None
 ) -> Iterator[tuple[str, _Outcomes]]:
-    """Record all jobs, each a task with some seeds, in several processes. Yield the results as they come.
-
-    Raises:
-        KervError: A worker process was killed.
-    """
+    """Record all jobs, each a task with some seeds, in several processes. Yield the results as they come."""
     if config.workers == 1 or len(jobs) == 1:
         yield from (_record_seeds(config, out, task, seeds, make_actor) for task, seeds in jobs)
         return

@@ -44,11 +44,7 @@ _NOISE = 0.02
 
 @functools.cache
 def check_packages() -> None:
-    """Check that LIBERO, its five asset packages and its simulator are installed in versions that work together.
-
-    Raises:
-        UsageError: A package is missing or has another version. Or another package has the import name `libero`, too.
-    """
+    """Check that LIBERO, its five asset packages and its simulator are installed in versions that work together."""
     for owner in packages_distributions().get("libero", ()):
         if owner != PACKAGE:
             again = f"pip install --force-reinstall --no-deps {PACKAGE}=={version(PACKAGE)}"
@@ -81,11 +77,7 @@ class Libero(MujocoWorld):
         return self._placement.copy()
 
     def _build(self) -> None:
-        """Build the simulator, which takes about ten seconds.
-
-        Raises:
-            RenderingUnavailable: No OpenGL backend works here. robosuite cannot be imported without a backend.
-        """
+        """Build the simulator, which takes about ten seconds."""
         choose_backend()
         logging.getLogger("robosuite_logs").setLevel(logging.ERROR)  # it asks for a file of private settings
         with warnings.catch_warnings():
@@ -220,11 +212,7 @@ class LiberoExpert:
     """
 
     def __init__(self, spec: EnvironmentSpec, task: str) -> None:
-        """Look up at which side the bowl is gripped in a task, and how high it is carried.
-
-        Raises:
-            UnknownName: There is no such task.
-        """
+        """Look up at which side the bowl is gripped in a task, and how high it is carried."""
         name = spec.task(task).name
         angle = math.radians(_SIDES.get(name, _LEFT))
         self._side = np.array([_RIM * math.cos(angle), _RIM * math.sin(angle), _LOW])

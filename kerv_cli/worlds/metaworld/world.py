@@ -98,11 +98,7 @@ class MetaWorldExpert:
     """Scripted controller of one task: Meta-World's own, or kerv's replacement (`OURS`)."""
 
     def __init__(self, spec: EnvironmentSpec, task: str) -> None:
-        """Find the controller of a task.
-
-        Raises:
-            UnknownName: There is no such task.
-        """
+        """Find the controller of a task."""
         name = spec.task(task).name
         load_mujoco()
         from metaworld.policies import ENV_POLICY_MAP
