@@ -21,7 +21,7 @@ from loaded import datastore_of
 from mock_target import SEVEN
 
 from kerv_cli.base.config import compose
-from kerv_cli.base.errors import CheckpointError, KervError, UsageError
+from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import read_json, sha256_of, write_json
 from kerv_cli.base.manifests import read_file
 from kerv_cli.base.paths import find_target, shipped_dir
@@ -311,7 +311,7 @@ def test_what_does_not_fit_is_refused_in_one_line(change, says, tmp_path):
     ("override", "kind", "says"),
     [
         ("window=3", UsageError, "window=3"),
-        (f"window={STEPS}", KervError, f"longer than a window of {STEPS}"),
+        (f"window={STEPS}", UsageError, "from 4 to 10"),
         ("task=push", CheckpointError, "no episode of push-v3"),
         ("demos=absent", CheckpointError, "kerv demos"),
         ("policy.target=absent", UsageError, "no target 'absent'"),
