@@ -122,6 +122,7 @@ def test_acceptance_by_place_by_hand(data):
         "conditional_acceptance_rate_per_pos": [1, 5 / 6, 1],
         "num_reached_tokens_per_dof": [0, 6, 6, 6],
         "conditional_acceptance_rate_per_dof": [None, 1, 5 / 6, 1],
+        "mean_accepted_difference_per_dof": [None, 5, 6, (5 * 7 + 8) / 6],  # the target's tokens are 0
     }
     acceptance = found["kerv"]["acceptance"]
     assert acceptance.keys() == expected.keys()

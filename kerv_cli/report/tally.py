@@ -30,6 +30,7 @@ class Tally:
         reached: (D,) number of judged tokens of each DoF. Verification reached these tokens, because it accepted all
             tokens before them.
         accepted: (D,) number of accepted tokens of each DoF.
+        drift: (D,) sum over these of draft token − target's token, in bins.
     """
 
     nodes: int
@@ -37,9 +38,18 @@ class Tally:
     judged: np.ndarray
     reached: np.ndarray
     accepted: np.ndarray
+    drift: np.ndarray
 
     @classmethod
-    def of(cls, start: np.ndarray, judged: np.ndarray, accepted: np.ndarray, nodes: np.ndarray, dofs: int) -> Tally:
+    def of(
+        cls,
+        start: np.ndarray,
+        judged: np.ndarray,
+        accepted: np.ndarray,
+        nodes: np.ndarray,
+        differences: np.ndarray,
+        dofs: int,
+    ) -> Tally:
         """Count n verifications.
 
         Args:
@@ -47,22 +57,27 @@ class Tally:
             judged: (n,) number of judged tokens: the accepted tokens, and the first rejected token if there is one.
             accepted: (n,) number of accepted draft tokens.
             nodes: (n,) number of verified draft tokens.
+            differences: Draft token − target's token, of all judged tokens one after the other.
             dofs: Number of DoFs D.
         """
         position = np.arange(judged.sum()) - np.repeat(np.cumsum(judged) - judged, judged)
         dof, taken = (np.repeat(start, judged) + position) % dofs, position < np.repeat(accepted, judged)
         counts = (np.bincount(accepted), np.bincount(judged), np.bincount(dof, minlength=dofs))
-        return cls(int(nodes.sum()), *counts, np.bincount(dof[taken], minlength=dofs))
+        accepted_dof = dof[taken]
+        drift = np.bincount(accepted_dof, differences[taken], minlength=dofs).astype(np.int64)
+        return cls(int(nodes.sum()), *counts, np.bincount(accepted_dof, minlength=dofs), drift)
 
     @classmethod
     def of_records(cls, decodes: Iterable[DecodeRecord], dofs: int) -> Tally:
         """Count the verifications of some decodes. `dofs` is the number of DoFs of an action."""
         numbers: list[tuple[int, int, int, int]] = []
+        differences: list[int] = []
         for decode in decodes:
-            verified = filter(attrgetter("is_verification"), decode.rounds)
-            numbers += [(one.start, len(one.drafted), one.accepted, one.tree_size) for one in verified]
+            for one in filter(attrgetter("is_verification"), decode.rounds):
+                numbers.append((one.start, len(one.drafted), one.accepted, one.tree_size))
+                differences += map(int.__sub__, one.drafted, one.target_tokens)
         start, judged, accepted, nodes = np.array(numbers, int).reshape(-1, 4).T
-        return cls.of(start, judged, accepted, nodes, dofs)
+        return cls.of(start, judged, accepted, nodes, np.array(differences, int), dofs)
 
     @classmethod
     def of_rounds(cls, rounds: pa.StructArray) -> Tally:
@@ -72,12 +87,16 @@ class Tally:
         is_verification = pc.and_(pc.greater(rounds.field("tree_size"), 0), pc.not_equal(rounds.field("mode"), "skip"))
         rounds = rounds.filter(is_verification)
         start, accepted, nodes = rounds.field("start"), rounds.field("accepted"), rounds.field("tree_size")
-        judged = pc.list_value_length(rounds.field("drafted")).to_numpy().astype(np.int64)
+        drafted, targets = rounds.field("drafted"), rounds.field("target_tokens")
+        judged, given = (pc.list_value_length(lists).to_numpy().astype(np.int64) for lists in (drafted, targets))
+        # a bonus may follow the target's tokens at the judged places
+        places = np.arange(judged.sum()) + np.repeat(np.cumsum(given) - given - np.cumsum(judged) + judged, judged)
+        differences = drafted.flatten().to_numpy() - targets.flatten().to_numpy()[places]
         dofs = len(rounds.field("threshold")[0]) if len(rounds) else 0
-        return cls.of(start.to_numpy(), judged, accepted.to_numpy(), nodes.to_numpy(), dofs)
+        return cls.of(start.to_numpy(), judged, accepted.to_numpy(), nodes.to_numpy(), differences, dofs)
 
     def __add__(self, other: Tally) -> Tally:
-        counts = attrgetter("lengths", "judged", "reached", "accepted")
+        counts = attrgetter("lengths", "judged", "reached", "accepted", "drift")
         return Tally(self.nodes + other.nodes, *map(_sum, counts(self), counts(other)))
 
     @property
@@ -108,6 +127,7 @@ class Tally:
             "conditional_acceptance_rate_per_pos": rates(reached, accepted),
             "num_reached_tokens_per_dof": self.reached.tolist(),
             "conditional_acceptance_rate_per_dof": rates(self.reached, self.accepted),
+            "mean_accepted_difference_per_dof": rates(self.accepted, self.drift),
         }
 
 
