@@ -78,7 +78,7 @@ def test_a_quick_preparation_makes_what_the_methods_of_the_own_study_need():
     quick = compose("prepare", ["quick=true"], SCHEMAS["prepare"])
     assert quick.steps < compose("train_drafter", [], SCHEMAS["train_drafter"]).train.steps
     of_study = {kind for one in resolve(["study=own"]).settings.values() for kind in Method.of(one).needs}
-    assert set(needs(tuple(quick.methods), True)) == of_study
+    assert set(needs(tuple(quick.methods))) == of_study
 
 
 @pytest.mark.parametrize("row", range(max(map(len, PARTS.values()))))
