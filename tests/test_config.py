@@ -17,10 +17,12 @@ from kerv_cli.base.limits import check_label, check_settings, description
 from kerv_cli.base.paths import artifact, find_target
 from kerv_cli.base.registry import PART_GROUPS, SETTINGS_GROUPS, NoSettings, part_of, parts
 from kerv_cli.cli.common import settings_yaml
+from kerv_cli.episodes.interface import read_interface
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.compose import Method
 from kerv_cli.training.preparation import needs
+from kerv_cli.worlds.libero.spec import SPEC as LIBERO
 
 SCHEMAS = {
     name.replace(" ", "_"): part.settings for name, part in parts("command").items() if part.settings is not NoSettings
@@ -51,7 +53,7 @@ def test_every_setting_has_a_description():
     assert undescribed == []
 
 
-WHOLE = {group: names for group, names in groups().items() if group not in PART_GROUPS}
+WHOLE = {group: names for group, names in groups().items() if group not in (*PART_GROUPS, "interface")}
 PARTS = {group: groups()[group] for group in PART_GROUPS}
 
 
@@ -59,7 +61,15 @@ PARTS = {group: groups()[group] for group in PART_GROUPS}
 def test_every_config_composes(choice):
     group, name = choice
     command = HOMES.get(name if group == "train" else group, "train_target" if group == "train" else "rollout")
-    compose(command, [f"{group}={name}"], SCHEMAS[command])
+    needs = ["policy.url=ws://HOST:1"] if choice == ("policy", "remote") else []
+    compose(command, [f"{group}={name}", *needs], SCHEMAS[command])
+
+
+@pytest.mark.parametrize("name", groups()["interface"])
+def test_every_interface_is_read_and_names_what_its_environment_has(name):
+    interface = read_interface(name)
+    assert all(camera.partition(":")[0] in LIBERO.cameras for camera in interface.cameras)
+    assert interface.kerv or interface.environment == LIBERO.name
 
 
 def test_quick_is_a_preset_that_typed_settings_override():

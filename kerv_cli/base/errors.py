@@ -77,6 +77,10 @@ class Interrupted(KervError):
     exit_code = 130
 
 
+class EpisodeError(KervError):
+    """One episode failed, for example by a wrong answer of a server. Other episodes of its setting go on."""
+
+
 class RenderingUnavailable(KervError):
     """No OpenGL backend of this machine can draw a frame."""
 

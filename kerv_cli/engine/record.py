@@ -89,6 +89,21 @@ class Delay:
 
 
 @dataclass(frozen=True)
+class Served:
+    """What a policy's server says about one of its answers.
+
+    Attributes:
+        seconds: Its own time for the answer. NaN if it says nothing.
+        drafts: Number of drafts that it verified.
+        accepted: Number of draft tokens that it accepted.
+    """
+
+    seconds: float = math.nan
+    drafts: int = 0
+    accepted: int = 0
+
+
+@dataclass(frozen=True)
 class DecodeRecord:
     """Result of decoding one observation: the actions to execute, and how they were computed."""
 
@@ -96,7 +111,7 @@ class DecodeRecord:
     actions: np.ndarray  # (steps, D) float32, environment units, to be executed; steps ≤ H
     forwards: int  # target forwards, prefill included
     rounds: tuple[Round, ...]
-    mode: str  # proposer of the first round that drafted; "skip": not verified; PARALLEL; "ar": no draft; "expert"
+    mode: str  # proposer of the first round that drafted; "ar": none did; "skip", PARALLEL, "expert" or "remote"
     seconds: float  # inference time (docs/methods.md §7), device synchronised at both ends; NaN: not timed
     phases: dict[str, float]  # seconds by phase, keys from PHASES
     compensated: int = 0  # tokens filled by a prediction instead of the target
@@ -109,6 +124,7 @@ class DecodeRecord:
     reason: str | None = None  # the skip rule's reason to skip or to verify
     deviation: float | None = None  # mean |difference| to autoregressive actions; None: not measured
     delay: Delay | None = None  # None: the world waited for the decode
+    served: Served | None = None  # of a policy behind a server
 
     @property
     def delay_steps(self) -> int | None:

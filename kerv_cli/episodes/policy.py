@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hashlib import sha256
 from operator import attrgetter
 from pathlib import Path
 
@@ -14,16 +15,19 @@ from kerv_cli.base.paths import results_dir
 from kerv_cli.base.registry import DRAFTING
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.spaces import Observation, ObservationSpace
+from kerv_cli.base.wire import packed
 from kerv_cli.engine.chunk import Follower
 from kerv_cli.engine.decoder import Decoder, Stopwatch
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.episodes.cost import Profile, prices, read_profile, work_of_record
 from kerv_cli.episodes.episode import Latency, RealClock, steps_during
 from kerv_cli.episodes.identity import OBSERVATION
+from kerv_cli.episodes.interface import read_interface
+from kerv_cli.episodes.remote import RemoteDecoder, metadata_of
 from kerv_cli.episodes.settings import CHUNK, MEASURED, PROFILE, REAL, WAITS, RolloutSettings
 from kerv_cli.methods.artifacts import Artifacts, Use
 from kerv_cli.methods.compose import Method
-from kerv_cli.methods.settings import EXPERT, MethodSettings
+from kerv_cli.methods.settings import EXPERT, MODEL, REMOTE, MethodSettings
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.spec import EnvironmentSpec
@@ -58,10 +62,13 @@ def check(settings: RolloutSettings) -> dict[str, str]:
     spec = spec_of(tasks[0])
     _check_seeds(settings, spec)
     spec.check_stress(settings.world.stress)
+    if settings.policy.kind != MODEL:
+        _check_undecoded(settings)
+        _check_clock(settings, spec, None)
+    if settings.policy.kind == REMOTE:
+        return _check_remote(settings, spec)
     if settings.policy.kind == EXPERT:
         spec.check_experts(tasks)
-        _check_expert(settings)
-        _check_clock(settings, spec, None)
         experts = ";".join(f"{task} {spec.experts[task]}" for task in sorted(tasks) if task in spec.experts)
         return {"target": "", **({"expert": experts} if experts else {}), OBSERVATION: PRIVILEGED}
     artifacts = artifacts_of(settings)
@@ -94,8 +101,19 @@ def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
     spec.seeds.check(seeds, purpose, f"seed={settings.seed} episodes={settings.episodes}")
 
 
-def _check_expert(settings: RolloutSettings) -> None:
-    """Refuse settings that need a decoding method, because the expert decodes nothing.
+def _check_remote(settings: RolloutSettings, spec: EnvironmentSpec) -> dict[str, str]:
+    """Ask the server what it serves. Return what determines its results, see `check`."""
+    metadata = metadata_of(settings.policy.url)
+    interface = read_interface(settings.policy.interface).adapted(metadata, settings.policy.execute)
+    interface.check(spec, settings.world)
+    server = sha256(packed({"name": settings.policy.target, "metadata": metadata}))
+    reads = sha256(repr(interface).encode())
+    observation = PRIVILEGED if interface.is_privileged else "vision"
+    return {"target": "", "server": server.hexdigest(), "interface": reads.hexdigest(), OBSERVATION: observation}
+
+
+def _check_undecoded(settings: RolloutSettings) -> None:
+    """Refuse settings that need a decoding method, because the expert decodes nothing, and a server in its own way.
 
     Raises:
         UsageError: Such a setting has another value than its default.
@@ -107,8 +125,9 @@ def _check_expert(settings: RolloutSettings) -> None:
     )
     for key, value in plain.items():
         if value != default[key]:
-            word = f"{key}={getattr(value, 'kind', value)}"
-            raise UsageError(f"policy=expert with {word}: the expert decodes nothing, leave it out")
+            word, kind = f"{key}={getattr(value, 'kind', value)}", settings.policy.kind
+            why = "the expert decodes nothing" if kind == EXPERT else "the server decides it"
+            raise UsageError(f"policy={kind} with {word}: {why}, leave it out")
 
 
 def _check_clock(settings: RolloutSettings, spec: EnvironmentSpec, target: TargetDescription | None) -> dict[str, str]:
@@ -133,8 +152,8 @@ def _check_clock(settings: RolloutSettings, spec: EnvironmentSpec, target: Targe
     if timing.latency == PROFILE:
         if target is None:
             raise UsageError(
-                "policy=expert with rollout.latency=profile: it has no forwards; use rollout.latency=constant or "
-                "measured"
+                f"policy={settings.policy.kind} with rollout.latency=profile: it has no forwards; use "
+                "rollout.latency=constant or measured"
             )
         _profile_latency(settings, target)
         return {"profile": sha256_of(_profile_path(settings))}
@@ -162,6 +181,8 @@ def decoder_for(settings: RolloutSettings, task: str) -> Follower:
         CheckpointError: The policy is damaged, or an artifact is missing or belongs to another target or action space.
     """
     spec = spec_of(task)
+    if settings.policy.kind == REMOTE:
+        return RemoteDecoder(settings.policy, read_interface(settings.policy.interface), spec)
     expert = settings.policy.kind == EXPERT
     decoder: Follower = ExpertDecoder(task) if expert else method_decoder(settings, task)
     warm_up(decoder, task, spec.observation, settings.world.camera.size)

@@ -16,6 +16,7 @@ from kerv_cli.base.limits import check_label
 from kerv_cli.base.paths import find_target
 from kerv_cli.base.registry import METHOD_KINDS, PART_GROUPS, AcceptancePart, ArtifactPart
 from kerv_cli.episodes.identity import NOT_DETERMINING, NOT_DETERMINING_RUNTIME, Setting, flat, work_of
+from kerv_cli.episodes.interface import read_interface
 from kerv_cli.episodes.settings import (
     CONSTANT,
     DEFAULT_TASKS,
@@ -27,7 +28,7 @@ from kerv_cli.episodes.settings import (
     SweepSettings,
 )
 from kerv_cli.methods.compose import Method
-from kerv_cli.methods.settings import EXPERT
+from kerv_cli.methods.settings import MODEL, REMOTE
 from kerv_cli.worlds import resolve_tasks, settled
 
 MOST_SEEDS = 10_000
@@ -286,6 +287,8 @@ def _settle(settings: Iterable[RolloutSettings], baseline: RolloutSettings, narr
     for setting in settings:
         setting.task = narrowed or setting.task or tasks
         setting.world = settled(setting.world, resolve_tasks(setting.task))
+        if setting.policy.kind == REMOTE and (pixels := read_interface(setting.policy.interface).pixels):
+            setting.world.camera = replace(setting.world.camera, size=pixels, supersample=1)
 
 
 def _is_ar(settings: RolloutSettings) -> bool:
@@ -330,10 +333,13 @@ def _without_effect(overrides: Iterable[str], idle: Mapping[str, str]) -> dict[s
 def idle_keys(settings: RolloutSettings) -> dict[str, str]:
     """Return the keys of settings that have no effect in this combination, each with the reason.
 
-    Empty for the scripted expert: unused settings are refused there.
+    For the scripted expert and a server, other settings of methods are refused.
     """
-    if settings.policy.kind == EXPERT:
-        return {}
+    if settings.policy.kind != MODEL:
+        pixels = read_interface(settings.policy.interface).pixels if settings.policy.kind == REMOTE else 0
+        drawn = dict.fromkeys(("size", "supersample"), f"{settings.policy.interface} wants pictures of {pixels} pixels")
+        unused = {f"world.camera.{name}": reason for name, reason in drawn.items() if pixels}
+        return unused | ({"method": "the server decides it"} if settings.policy.kind == REMOTE else {})
     method, timing, batch = Method.of(settings), settings.rollout, settings.rollout.batch
     draft, proposer, skip, needed = method.prefill_draft, method.proposer, method.skip, set(method.needs)
     acceptance = AcceptancePart.find(settings.acceptance.kind)
@@ -384,7 +390,7 @@ def trained_tasks(settings: RolloutSettings) -> tuple[str, ...]:
     Raises:
         CheckpointError: The target's description is damaged.
     """
-    if settings.policy.kind == EXPERT:
+    if settings.policy.kind != MODEL:
         return ()
     try:
         folder = find_target(settings.results, settings.policy.target)

@@ -26,9 +26,17 @@ def _summed(value: Callable[[DecodeRecord], Any]) -> Callable[[EpisodeRecord], A
     return lambda episode: sum(value(decode) or 0 for decode in episode.decodes)
 
 
-def _judged(value: Callable[[Round], int]) -> Callable[[EpisodeRecord], int]:
-    """Return a function that sums a value over those rounds of an episode in which a draft was verified."""
-    return _summed(lambda decode: sum(value(one) for one in decode.rounds if one.is_verification))
+def _judged(value: Callable[[Round], int], *served: str) -> Callable[[EpisodeRecord], int]:
+    """Return a function that sums a value over those rounds of an episode in which a draft was verified.
+
+    `served` are the attributes of `Served` that a server sends in place of rounds.
+    """
+    return _summed(
+        lambda decode: (
+            sum(value(one) for one in decode.rounds if one.is_verification)
+            + sum(getattr(decode.served, name, 0) for name in served)
+        )
+    )
 
 
 def _delay(name: str) -> Callable[[DecodeRecord], Any]:
@@ -69,11 +77,14 @@ _EPISODE: Fields = {
     "decodes": (INT, lambda episode: len(episode.decodes)),
     **_columns("seconds", kind=FLOAT),  # inference time
     **_columns(*PHASES, kind=FLOAT, read=lambda phase: _summed(_phase(phase)), as_="seconds.{}"),
+    # a server's own time, and the number of its answers
+    "server_seconds": (FLOAT, _summed(lambda decode: decode.served.seconds if decode.served else 0.0)),
+    "server_decodes": (INT, _summed(lambda decode: decode.served is not None)),
     **_columns("forwards"),
-    "verifications": (INT, _judged(lambda one: 1)),
+    "verifications": (INT, _judged(lambda one: 1, "drafts")),
     "tokens": (INT, _summed(lambda decode: len(decode.tokens))),  # committed in all rounds
-    "committed": (INT, _judged(lambda one: one.committed)),  # in verifications, bonus included
-    "accepted": (INT, _judged(lambda one: one.accepted)),  # draft tokens accepted in verifications
+    "committed": (INT, _judged(lambda one: one.committed, "drafts", "accepted")),  # in verifications, bonus included
+    "accepted": (INT, _judged(lambda one: one.accepted, "accepted")),  # draft tokens accepted in verifications
     "first_rejected_sum": (INT, _summed(lambda decode: decode.first_rejected)),  # over chunks that had a verification
     "first_rejected_count": (INT, _summed(lambda decode: decode.first_rejected is not None)),
     "compensated_tokens": (INT, _summed(lambda decode: decode.compensated)),

@@ -25,6 +25,7 @@ from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.record import DecodeRecord, EpisodeRecord
 from kerv_cli.episodes.episode import episode, run_episode
 from kerv_cli.episodes.policy import clock_for, decoder_for, method_decoder
+from kerv_cli.episodes.remote import close_servers
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.unverified import native_decoder
 from kerv_cli.worlds import spec_of
@@ -71,9 +72,10 @@ def new_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) ->
 
 
 def close_worlds() -> None:
-    """Close every world that `open_world` keeps open."""
+    """Close every world that `open_world` keeps open, and the connections to servers."""
     while _opened:
         _opened.popitem()[1].close()
+    close_servers()
 
 
 class Runner:

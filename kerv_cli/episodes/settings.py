@@ -8,7 +8,7 @@ from typing import ClassVar
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import choice, number, setting
 from kerv_cli.base.settings import CommandSettings, TaskSettings
-from kerv_cli.methods.settings import EXPERT, MethodSettings
+from kerv_cli.methods.settings import EXPERT, REMOTE, MethodSettings
 from kerv_cli.worlds.settings import EVALUATION_SEED, RolloutWorldSettings
 
 WAITS, REAL = "waits", "real"
@@ -76,6 +76,14 @@ class RolloutSettings(MethodSettings, TaskSettings):
     def __post_init__(self) -> None:
         if self.policy.kind == EXPERT:
             self.method = EXPERT  # the expert uses no decoding method
+        if self.policy.kind == REMOTE:
+            self.method = REMOTE if self.method == "ar" else self.method  # the default
+            self.policy.target = self.policy.name or self.policy.url
+
+    def check_together(self, prefix: str) -> None:
+        """Refuse a method of a policy whose server chooses it."""
+        if self.policy.kind == REMOTE and self.method != REMOTE:
+            raise UsageError(f"method={self.method} with policy=remote: the server decides it, leave it out", "method")
 
 
 @dataclass

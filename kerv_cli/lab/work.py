@@ -28,7 +28,7 @@ from typing import Any, TypeVar
 
 import sqlalchemy as sa
 
-from kerv_cli.base.errors import CheckpointError, KervError, StorageError
+from kerv_cli.base.errors import CheckpointError, EpisodeError, KervError, StorageError
 from kerv_cli.base.runtime import set_up
 from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.episodes.identity import ENGINE, OBSERVATION, Setting
@@ -652,7 +652,8 @@ class _Attempt:
         same: list[Episode] = []
         others: list[Episode] = []
         for other in self.left:
-            is_same = (other.setting.work, other.task) == (one.setting.work, one.task)
+            alone = isinstance(failure.error, EpisodeError)
+            is_same = other is one if alone else (other.setting.work, other.task) == (one.setting.work, one.task)
             (same if is_same else others).append(other)
         if not same:
             return

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import choice, number, setting
 from kerv_cli.base.registry import METHOD_KINDS, parts
 from kerv_cli.base.settings import RunSettings, part
 
-MODEL, EXPERT = "model", "expert"
+MODEL, EXPERT, REMOTE = "model", "expert", "remote"
 
 
 @dataclass
@@ -19,11 +20,28 @@ class PolicySettings:
     Target and artifacts are chosen by the name of a folder in results/pretrained or results/artifacts, or by a path.
     """
 
-    kind: str = choice(MODEL, MODEL, EXPERT, help="expert: the environment's scripted policy, without decoding")
+    # expert: the environment's scripted policy, without decoding; remote: the policy behind `url`
+    kind: str = choice(MODEL, MODEL, EXPERT, REMOTE, help="what decodes: weights, a script, or a server")
     target: str = setting("mt10-vision", "name of the policy's weights, or a path")
     artifacts: dict[str, str | None] = setting(
         lambda: dict.fromkeys(parts("artifact")), "artifacts.KIND=NAME; null: the one beside the target"
     )
+    url: str = setting("", "policy=remote: address of the server, ws://HOST:PORT")
+    name: str = setting("", "policy=remote: what is served; episodes are reused under the same name; empty: the url")
+    interface: str = setting(
+        "kerv", "policy=remote: what the server reads and sends: a name in conf/interface, or a file"
+    )
+    execute: int = number(0, 0, 1024, help="policy=remote: actions of an answer that are executed; 0: the interface's")
+
+    def check_together(self, prefix: str) -> None:
+        """Refuse a remote policy without an address, and an address without a remote policy."""
+        if self.kind != REMOTE:
+            if self.url:
+                raise UsageError(f"{prefix}url={self.url} is of policy=remote: add it", f"{prefix}url")
+        elif not self.url.startswith(("ws://", "wss://")):
+            raise UsageError(
+                f"policy=remote with {prefix}url={self.url}: write {prefix}url=ws://HOST:PORT", f"{prefix}url"
+            )
 
 
 # help text of a setting that several commands have

@@ -51,6 +51,7 @@ class Measures:
         latency_p50_ms: Median time of a decode, milliseconds.
         latency_p95_ms: 95th percentile of the time of a decode, milliseconds.
         latency_worst_ms: Time of the slowest decode, milliseconds.
+        server_ms: Mean time of an answer as the policy's server measures it, milliseconds.
         AL: Acceptance length, tokens per verification.
         accepted_per_round: Accepted draft tokens per verification.
         AFEP: Mean position of a draft's first rejected token.
@@ -93,6 +94,7 @@ class Measures:
     latency_p50_ms: float
     latency_p95_ms: float
     latency_worst_ms: float
+    server_ms: float = field(metadata={RATIO: ("server_seconds", "server_decodes")})
     AL: float = field(metadata={RATIO: ("committed", "verifications")})
     accepted_per_round: float = field(metadata={RATIO: ("accepted", "verifications")})
     AFEP: float = field(metadata={RATIO: ("first_rejected_sum", "first_rejected_count")})
@@ -356,7 +358,7 @@ def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame
     other = episodes[columns].assign(time=episodes["seconds"] / episodes["steps"])
     method = other.assign(
         difficulty=episodes["difficulty"],
-        decodes=(episodes["forwards"] > 0) | (episodes["skipped_decodes"] > 0),  # a scripted expert does neither
+        decodes=(episodes["forwards"] > 0) | (episodes["skipped_decodes"] > 0) | (episodes["server_decodes"] > 0),
         baseline=other["label"].map(baselines),
     )
     other = other.rename(columns={"label": "baseline"})
@@ -466,7 +468,8 @@ def _means(episodes: pd.DataFrame, by: list[str]) -> pd.DataFrame:
     sums = groups[list(dict.fromkeys(itertools.chain.from_iterable(_RATIOS.values())))].sum()
     for name, (above, below) in _RATIOS.items():
         means[name] = sums[above] / sums[below].mask(sums[below] == 0)
-    means["felt_latency_ms"] *= 1000.0
+    means[["felt_latency_ms", "server_ms"]] *= 1000.0
+    means["server_ms"] = means["server_ms"].where(means["server_ms"] > 0)  # 0: the servers do not say
     for name, part in ColumnPart.every().items():  # of plugins
         means[name] = [float(part.built(group)) for _, group in groups]
     return means

@@ -79,9 +79,10 @@ def repriced(data: StudyData, profiles: Sequence[NamedProfile], lenient: bool = 
     """
     if not profiles:
         return []
-    decoded, works = data.episodes.groupby("label")[["forwards", "skipped_decodes"]].sum().any(axis=1), {}
+    here = data.episodes[data.episodes["server_decodes"].fillna(0) == 0]  # a server's phases are unknown
+    decoded, works = here.groupby("label")[["forwards", "skipped_decodes"]].sum().any(axis=1), {}
     for label in data.labels:
-        if decoded[label] and not (lenient and data.settings[label].batch > 1):
+        if decoded.get(label) and not (lenient and data.settings[label].batch > 1):
             works[label] = _work_of_label(data, label)
     rows = []
     for named in profiles if works else ():

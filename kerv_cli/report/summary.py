@@ -44,6 +44,7 @@ _HEADING = 12
 """Width at which a heading is wrapped, in characters."""
 _LABEL = 16
 """Width at which a label is wrapped, in characters."""
+ANSWER, OF_SERVER = "median answer, ms", "of it the server's, ms"
 MEANINGS = {
     "success": "share of episodes that solved their task",
     DIFFERENCE: "points more or less than {0}, over pairs: episodes of both from the same initial state",
@@ -53,6 +54,8 @@ MEANINGS = {
     SPEEDS["speedup"]: "the same for the time of a control step. * means: some pairs were not measured in turn; the "
     "speed is of the others",
     LATENCY: "95 % of the decodes take less time than this",
+    ANSWER: "median time from an observation to the server's actions, as the client sees it",
+    OF_SERVER: "mean of the time that the server itself measures for an answer",
     "tokens unverified": "executed tokens that the policy neither wrote nor accepted",
     "tokens per verification": "how many tokens one verification yields on average (acceptance length)",
     "speed at matched success": "speed of the method's fastest setting that is shown to lose less than 3 points",
@@ -128,6 +131,8 @@ def cells_of(row: Result, of: Measures | None = None) -> Cells:
         LATENCY: number(of.latency_p95_ms),
         SPEEDS["speedup"]: _speed(row, of.speedup),
         "a decode takes, ms": number(of.felt_latency_ms),
+        ANSWER: number(of.latency_p50_ms) if is_number(of.server_ms) else MISSING,
+        OF_SERVER: number(of.server_ms),
         "steps on a held action": share(of.held_share),
         "tokens per verification": number(of.AL),
         "forwards per step": number(of.forwards_per_step),
@@ -256,7 +261,7 @@ def not_in_turn(results: Sequence[Result]) -> list[str]:
         of = row.measures
         if row.is_baseline and not of.is_timed:
             return []
-        decodes = of.forwards_per_step + of.skip_rate > 0
+        decodes = of.forwards_per_step + of.skip_rate > 0 or is_number(of.server_ms)
         if row.is_compared and decodes and of.is_timed and not is_number(of.speedup.value):
             apart[row.label] = None
     return list(apart)
@@ -287,8 +292,10 @@ def setting_tables(data: StudyData) -> Iterator[tuple[Any, Any, str]]:
     if timed:
         decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()
         shares = []
-        for phase in PHASES:
-            seconds = episodes[f"seconds.{phase}"].sum()
+        times = {phase: episodes[f"seconds.{phase}"].sum() for phase in PHASES}
+        if of_server := episodes["server_seconds"].sum():
+            times = {"server": of_server, "network and client": total - of_server}
+        for phase, seconds in times.items():
             if seconds:
                 shares.append((phase, f"{1000 * seconds / decodes:.2f}", f"{seconds / total:.0%}"))
         yield ("phase", "ms per decode", "share"), shares, "time by phase"

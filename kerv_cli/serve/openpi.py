@@ -25,6 +25,7 @@ def metadata(policy: Policy) -> dict[str, object]:
     """Return what the server tells a new client about the policy: cameras, state, actions, limits and chunk length."""
     interface, actions = policy.interface, policy.interface.actions
     about = {"server": "kerv", "policy": policy.settings.policy.target, "method": policy.settings.method}
+    about["work"] = policy.work
     images = {"cameras": list(interface.cameras), "image_size": interface.size}
     state = {"state": list(interface.observation.proprioception)}
     limits = {"actions": list(actions.names), "low": list(actions.low), "high": list(actions.high)}

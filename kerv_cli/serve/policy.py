@@ -19,6 +19,7 @@ from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.engine.protocol import Target
 from kerv_cli.engine.record import DecodeRecord
+from kerv_cli.episodes.identity import work_of
 from kerv_cli.episodes.policy import artifacts_of, warm_up
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods.artifacts import Use
@@ -115,6 +116,12 @@ class Policy:
             target: Any = decoder.target
             target.check()
         return record
+
+    @property
+    def work(self) -> str:
+        """Hash of the settings and weights that determine the actions."""
+        settings: Any = self.facts()["settings"]
+        return work_of(settings, self.identity)
 
     def facts(self) -> dict[str, object]:
         """Return settings, hashes of the policy's files, and the machine, for the server's greeting."""
