@@ -54,16 +54,10 @@ class EnvironmentPart(Part):
 
 
 def specs() -> Mapping[str, EnvironmentSpec]:
-    """Return the specifications of all registered environments, by name."""
     return {name: part.built() for name, part in EnvironmentPart.every().items()}
 
 
 def spec_of(task: str) -> EnvironmentSpec:
-    """Return the environment that has a task.
-
-    Args:
-        task: Full or short name of the task.
-    """
     owners = [spec for spec in specs().values() if spec.full_name(task) is not None]
     if not owners:
         raise UnknownName("task", task, [name for spec in specs().values() for name in spec.tasks])
@@ -73,20 +67,11 @@ def spec_of(task: str) -> EnvironmentSpec:
 
 
 def instruction_of(task: str) -> str:
-    """Return the instruction of a task.
-
-    Args:
-        task: Full or short name of a task of any environment.
-    """
     return spec_of(task).task(task).instruction
 
 
 def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the full names of tasks, in the order in which they were named and without repetitions.
-
-    Args:
-        names: Full or short names of tasks, and names of suites such as `MT10` or `mt50`.
-    """
+    """Return the full names of tasks and suites, such as `MT10` or `mt50`, in their order and without repetitions."""
     if not names:
         raise UsageError("name at least one task or suite: task=NAME")
     environments = specs().values()
@@ -105,15 +90,12 @@ def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def stands_for_tasks(name: str) -> bool:
-    """Return whether `name` is the name of a task or suite, written in small letters.
-
-    Demonstrations of one task or suite have such a name by default.
-    """
+    """Return whether `name` is a task or suite in small letters, as default names of demonstrations are."""
     return name == name.lower() and any(spec.expand(name) for spec in specs().values())
 
 
 def task_names() -> Iterator[str]:
-    """Yield the names of the suites and tasks of all environments, for shell completion."""
+    """Yield the names of all suites and tasks, for shell completion."""
     for part in EnvironmentPart.every().values():
         if part.names is not None:
             yield from part.names()
@@ -123,7 +105,7 @@ def task_names() -> Iterator[str]:
 
 
 def settled(world: W, tasks: Sequence[str]) -> W:
-    """Return a world's settings for tasks, whose defaults replace an empty camera name and a horizon of 0."""
+    """Replace an empty camera name and a horizon of 0 by the defaults of the tasks."""
     spec = spec_of(tasks[0])
     camera = replace(world.camera, name=spec.camera_name(world.camera.name))
     return replace(world, camera=camera, horizon=spec.control_steps(world.horizon, tasks))
@@ -143,7 +125,6 @@ def _libero_names() -> tuple[str, ...]:
 
 @EnvironmentPart("metaworld", names=_metaworld_names)
 def metaworld() -> EnvironmentSpec:
-    """Import the specification of Meta-World."""
     from kerv_cli.worlds.metaworld.spec import SPEC
 
     return SPEC
@@ -151,7 +132,6 @@ def metaworld() -> EnvironmentSpec:
 
 @EnvironmentPart("libero", names=_libero_names)
 def libero() -> EnvironmentSpec:
-    """Import the specification of LIBERO."""
     from kerv_cli.worlds.libero.spec import SPEC
 
     return SPEC

@@ -15,12 +15,7 @@ SIZE = 48  # pixels of a frame
 
 
 def check_environment(spec: EnvironmentSpec, seed: int) -> list[Finding]:
-    """Check an environment and return one finding per check.
-
-    Args:
-        spec: The environment.
-        seed: Seed of the first episode.
-    """
+    """Return one finding per check. Episodes have the seeds from `seed` on."""
     checks = {
         "same seed, same episode": _check_repeats,
         "another seed, another start": _check_starts_differ,
@@ -37,7 +32,6 @@ def _open(spec: EnvironmentSpec) -> World:
 
 
 def _check_repeats(spec: EnvironmentSpec, seed: int) -> str:
-    """Check that the same seed gives the same episode to the last bit, whether images are drawn or not."""
     states: list[list[np.ndarray]] = [[], []]
     for drawn in (False, True):
         random = np.random.default_rng(7)

@@ -10,13 +10,7 @@ from kerv_cli.base.errors import KervError
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of one check.
-
-    Attributes:
-        what: What was checked.
-        ok: Whether the check passed.
-        says: What the check saw, or the error message.
-    """
+    """Result of one check. `says` is what the check saw, or the error message."""
 
     what: str
     ok: bool
@@ -24,18 +18,12 @@ class Finding:
 
 
 def need(holds: object, message: str) -> None:
-    """Raise a KervError with this message if `holds` is false."""
     if not holds:
         raise KervError(message)
 
 
 def find(what: str, check: Callable[[], str]) -> Finding:
-    """Run a check. It fails if it raises any exception.
-
-    Args:
-        what: What is checked.
-        check: Function that runs the check. It returns a text that describes the result.
-    """
+    """Run a check, which returns what it saw. Any exception makes it fail."""
     try:
         return Finding(what, True, check())
     except Exception as error:  # noqa: BLE001 - the code under test is anybody's

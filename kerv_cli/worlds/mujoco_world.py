@@ -49,7 +49,6 @@ class MujocoWorld(World):
         """Return the model (MjModel), and its data (MjData) with all poses up to date."""
 
     def reset(self, seed: int) -> Observation:
-        """Start the episode of a seed: restore the model, reset the simulator, then apply the stress to the model."""
         self._changes.close()
         observation = super().reset(seed)
         self.stress.change(self._drawable()[0], self._changes)
@@ -62,7 +61,6 @@ class MujocoWorld(World):
         return self._cameras[camera].render(data)
 
     def close(self) -> None:
-        """Restore the model and free the graphics contexts."""
         self._changes.close()
         for camera in self._cameras.values():
             camera.close()
@@ -81,16 +79,14 @@ context.make_current()
 context.free()
 """
 _PROBE_SECONDS = 60.0
+# two software backends, EGL and OSMesa, on Debian and Ubuntu
 _INSTALL = f"{'' if os.geteuid() == 0 else 'sudo '}apt-get install -y libegl1 libosmesa6 libgl1-mesa-dri libgl1"
-"""Command that installs two software OpenGL backends (EGL and OSMesa) on Debian and Ubuntu."""
 
 
 def choose_backend() -> str:
-    """Choose an OpenGL backend that works here and return its name. Call it before mujoco is imported.
+    """Return an OpenGL backend that works here.
 
-    If the environment variable `MUJOCO_GL` is set, it decides. Otherwise EGL and then OSMesa are tried, each in its own
-    process, so that a broken driver cannot crash kerv. Worker processes inherit the choice through `MUJOCO_GL` and
-    `PYOPENGL_PLATFORM`.
+    Call it before mujoco is imported. Worker processes inherit the choice.
     """
     backend, error = find_backend()
     if error:
@@ -100,11 +96,7 @@ def choose_backend() -> str:
 
 @functools.cache
 def find_backend() -> tuple[str, str]:
-    """Find an OpenGL backend that works here. The search runs once per process.
-
-    Returns:
-        The backend's name, which is empty if none works, and an error message, which is empty if one works.
-    """
+    """Return the name of a working OpenGL backend, or an error message. The other one is empty."""
     # Software rendering with a thread pool per context is slower for small frames and crowds out other workers.
     os.environ.setdefault("LP_NUM_THREADS", "0")
     backend = os.environ.get("MUJOCO_GL", "").lower().strip()
@@ -123,7 +115,7 @@ def find_backend() -> tuple[str, str]:
 
 
 def _draws(backend: str) -> bool:
-    """Return whether a backend can draw here. The attempt runs in a process of its own."""
+    # in its own process, so that a broken driver cannot crash kerv
     environment = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
     command = [sys.executable, "-c", _PROBE]
     with contextlib.suppress(subprocess.SubprocessError):
@@ -133,10 +125,7 @@ def _draws(backend: str) -> bool:
 
 
 def load_mujoco() -> None:
-    """Import mujoco with an OpenGL backend if one works here.
-
-    Without a backend the physics still works. Only opening a Camera fails.
-    """
+    """Import mujoco, with an OpenGL backend if one works here. Without one, only opening a `Camera` fails."""
     if find_backend()[1]:
         os.environ.setdefault("MUJOCO_GL", "disable")  # otherwise mujoco tries glfw, which needs a display
     import mujoco  # noqa: F401
@@ -146,13 +135,6 @@ class Camera:
     """Draw one view of a MuJoCo model. Drawing never changes the physics."""
 
     def __init__(self, model: mujoco.MjModel, config: CameraSettings, upside_down: bool) -> None:
-        """Open an off-screen graphics context.
-
-        Args:
-            model: Model to draw.
-            config: View and size of the image.
-            upside_down: Whether the raw image must be rotated by 180 degrees.
-        """
         backend = choose_backend()
         import mujoco
 
@@ -181,7 +163,7 @@ class Camera:
         atexit.register(self.close)
 
     def render(self, data: mujoco.MjData) -> NDArray[np.uint8]:
-        """Return the image (size, size, 3) of the state in `data` as uint8 RGB, upright."""
+        """Return the image (size, size, 3) as uint8 RGB, upright."""
         fovy = self._model.cam_fovy[self._camera]
         self._model.cam_fovy[self._camera] = self.config.fovy  # set anew, because views of one model may differ
         self._renderer.update_scene(data, camera=self._camera)
@@ -191,20 +173,16 @@ class Camera:
         return np.ascontiguousarray(frame[::-1, ::-1] if self._upside_down else frame)
 
     def close(self) -> None:
-        """Free the graphics context. A second call does nothing."""
         atexit.unregister(self.close)
         self._renderer.close()
 
 
 def box_average(pixels: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
-    """Shrink an image: return the mean of every block of factor x factor pixels, rounded to the nearest integer.
+    """Return the mean of every block of factor x factor pixels, rounded to the nearest integer.
 
     Args:
         pixels: (factor * n, factor * m, channels) uint8.
         factor: 1 to 16, so that the sum of a block fits into 16 bits.
-
-    Returns:
-        (n, m, channels) uint8, a copy.
     """
     if factor == 1:
         return pixels.copy()

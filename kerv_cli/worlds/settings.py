@@ -9,11 +9,10 @@ from kerv_cli.base.limits import choice, number, setting
 from kerv_cli.base.registry import find
 from kerv_cli.base.settings import CommandSettings
 
+# first one; demonstrations use smaller seeds, so training and evaluation share no initial state
 EVALUATION_SEED = 100_000
-"""First seed for evaluation. Demonstrations use smaller seeds, so training and evaluation share no initial state."""
 
-MOST_STRESS = 4
-"""Highest level of every kind of stress."""
+MOST_STRESS = 4  # highest level of every kind
 
 
 @dataclass(unsafe_hash=True)  # used as a dictionary key; not frozen, because Hydra must override it
@@ -36,25 +35,16 @@ class WorldSettings:
 
 @dataclass
 class StressSettings:
-    """Settings of a stress: a disturbance of known size (docs/stress.md).
-
-    The disturbance of an episode is drawn from task, seed, kind and level.
-    """
+    """Settings of a stress: a disturbance of known size (docs/stress.md)."""
 
     kind: str = setting("none", "what is disturbed: push, light or sensor")
     level: int = number(0, 0, MOST_STRESS, help="strength of the disturbance; 0: none")
 
     @property
     def active(self) -> bool:
-        """Whether there is any disturbance."""
         return self.kind != "none" and self.level > 0
 
     def check_together(self, prefix: str) -> None:
-        """Check that kind and level fit together.
-
-        Args:
-            prefix: Key of these settings on the command line, with a dot at its end, for the error message.
-        """
         if self.kind != "none":  # else the kinds, which import numpy, are not loaded
             find("stress", self.kind, f"{prefix}kind")
         elif self.level:

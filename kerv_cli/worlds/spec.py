@@ -24,21 +24,19 @@ from kerv_cli.worlds.settings import CameraSettings, StressSettings
 from kerv_cli.worlds.stress import NO_STRESS, Stress, StressPart
 from kerv_cli.worlds.views import views_of
 
+# scripted controller of one task: from an observation to an action (D,) within the limits, without memory
 Expert: TypeAlias = Callable[[Observation], NDArray[np.float64]]
-"""Scripted controller of one task: maps an observation to an action (D,) within the limits. It has no memory."""
 
+# by the entry of `StressPart.requires` that an environment lacks
 _LACKS = {
     "position": "its actions have no group 'position'",
     "model": "its world has no MuJoCo model",
 }
-"""Error messages for environments that lack what a kind of stress needs, by the entry of `StressPart.requires`."""
 
 
 @dataclass(frozen=True)
 class Seeds:
-    """Three disjoint ranges of episode seeds.
-
-    They keep the initial states of training, tuning and reported episodes apart.
+    """Three disjoint ranges of episode seeds, so that their initial states differ.
 
     Attributes:
         training: Seeds for demonstrations.
@@ -51,15 +49,11 @@ class Seeds:
     evaluation: range = range(100_000, 2**31)
 
     def check(self, seeds: Iterable[int], purpose: str, what: str) -> None:
-        """Refuse seeds that lie outside the range for a purpose.
+        """Raise UsageError if a seed is outside the range for a purpose.
 
         Args:
-            seeds: Seeds to check.
             purpose: `training`, `selection` or `evaluation`.
             what: What the user typed, for the error message.
-
-        Raises:
-            UsageError: A seed is outside that range.
         """
         allowed: range = getattr(self, purpose)
         for seed in seeds:
@@ -76,7 +70,6 @@ class EnvironmentSpec:
     """All constants of an environment, and the class of its simulator.
 
     Attributes:
-        name: Name in the registry.
         actions: Action space, with the environment's limits.
         observation: Observation space. The privileged state (all numbers of the simulator) begins with the
             proprioception.
@@ -90,9 +83,7 @@ class EnvironmentSpec:
         suffix: Ending of all full task names. Users may leave it out.
         packages: Python packages whose versions determine the physics. The first one is the simulator's.
         extra: Extra of kerv that installs the simulator (`pip install 'kerv[EXTRA]'`). Empty if no extra is needed.
-        grip: Value of the gripper's DoF that closes the gripper, then the value that opens it. Empty if there is no
-            gripper.
-        seeds: Ranges of episode seeds.
+        grip: Value of the gripper's DoF that closes the gripper, then the value that opens it. Empty without a gripper.
         experts: Names of kerv's experts by task, for tasks in which they replace the simulator's experts.
     """
 
@@ -114,19 +105,11 @@ class EnvironmentSpec:
     experts: Mapping[str, str] = field(default_factory=dict)
 
     def full_name(self, task: str) -> str | None:
-        """Return the full name of a task, or None if this environment does not have it.
-
-        Args:
-            task: Full or short name.
-        """
+        """Return the full name of a task, given its full or short name. None if there is no such task."""
         return next((name for name in (task, task + self.suffix) if name in self.tasks), None)
 
     def task(self, name: str) -> Task:
-        """Return the task with a full or short name.
-
-        Raises:
-            UnknownName: There is no such task.
-        """
+        """Return the task with a full or short name, or raise UnknownName."""
         full = self.full_name(name)
         if full is None:
             raise UnknownName("task", name, self.tasks)
@@ -138,10 +121,7 @@ class EnvironmentSpec:
         return self.suites.get(name.upper()) or ((full,) if full else ())
 
     def camera_name(self, name: str) -> str:
-        """Check a camera's name and return it. If the name is empty, return the environment's first camera.
-
-        Args:
-            name: One camera, or several views joined by `+`.
+        """Check the name of a camera, or of several views joined by `+`. An empty name becomes the first camera.
 
         Raises:
             UnknownName: The environment has no such camera.
@@ -154,9 +134,6 @@ class EnvironmentSpec:
 
     def camera(self, settings: CameraSettings | None = None) -> CameraSettings:
         """Check camera settings and return them. An empty name becomes the environment's first camera.
-
-        Args:
-            settings: The settings. None stands for all defaults.
 
         Raises:
             UnknownName: The environment has no such camera.
@@ -187,12 +164,7 @@ class EnvironmentSpec:
         return horizon or found[0]
 
     def check_stress(self, settings: StressSettings) -> None:
-        """Refuse a kind of stress that is impossible in this environment.
-
-        Raises:
-            UnknownName: There is no such kind.
-            UsageError: The environment lacks something that the kind needs.
-        """
+        """Raise UsageError if the environment lacks something that a kind of stress needs."""
         if not settings.active:
             return
         offered = load(self.world_class).stressable if self.world_class else frozenset()
@@ -206,7 +178,7 @@ class EnvironmentSpec:
         """Return the action (D,) that keeps the robot where it is.
 
         Args:
-            opening: Current opening of the gripper, from 0 (closed) to 1 (open). The action keeps this opening.
+            opening: Opening of the gripper to keep, from 0 (closed) to 1 (open).
         """
         action = self.actions.middle.copy()
         if self.grip:
@@ -242,17 +214,16 @@ class EnvironmentSpec:
         load(self.world_class).check_installed()
 
     def open_world(self, task: str, camera: CameraSettings | None = None, horizon: int = 0) -> World:
-        """Return a world for a task. Its simulator is built at the first reset.
+        """Return a world for a task, given by its full or short name. Its simulator is built at the first reset.
 
         Args:
-            task: Full or short name.
             camera: Default view of `World.frame`. If None, the environment's first camera.
             horizon: Control steps of an episode. 0 stands for the task's default.
 
         Raises:
             UnknownName: There is no such task or camera.
-            UsageError: The simulator cannot run that many control steps or is not installed, or the environment is a
-                recorded dataset.
+            UsageError: The horizon is too large, the simulator is not installed, or the environment is a recorded
+                dataset.
         """
         self.check_installed()
         return load(self.world_class)(self, task, camera, horizon)
@@ -269,12 +240,7 @@ class EnvironmentSpec:
             )
 
     def expert(self, task: str) -> Expert:
-        """Return the scripted expert of a task.
-
-        Raises:
-            UnknownName: There is no such task.
-            UsageError: There is no expert.
-        """
+        """Return the scripted expert of a task. Raise UsageError if there is none."""
         self.check_experts([task])
         return load(self.expert_class)(self, task)
 
@@ -303,18 +269,6 @@ class World(ABC):
     def __init__(
         self, spec: EnvironmentSpec, task: str, camera: CameraSettings | None = None, horizon: int = 0
     ) -> None:
-        """Check names and numbers. The simulator is built at the first reset.
-
-        Args:
-            spec: The environment.
-            task: Full or short name of the task.
-            camera: Default view of `frame`. If None, the environment's first camera.
-            horizon: Control steps of an episode. 0 stands for the environment's default.
-
-        Raises:
-            UnknownName: There is no such task or camera.
-            UsageError: A camera setting is out of range, or the simulator cannot run that many control steps.
-        """
         entry = spec.task(task)
         self.spec, self.task, self.instruction = spec, entry.name, entry.instruction
         self.camera, self.horizon = spec.camera(camera), spec.control_steps(horizon, [entry.name])
@@ -332,10 +286,9 @@ class World(ABC):
 
     @abstractmethod
     def _advance(self, action: NDArray[np.float64]) -> tuple[NDArray[np.float64], bool]:
-        """Execute an action (D,), which is within the limits.
+        """Execute an action (D,) within the limits.
 
-        Returns:
-            The privileged state (s,) after the step, and the success flag.
+        Return the privileged state (s,) after the step, and the success flag.
         """
 
     @abstractmethod
@@ -349,7 +302,7 @@ class World(ABC):
     @property
     @abstractmethod
     def initial_state(self) -> NDArray[np.float64]:
-        """Numbers (n,) that, together with the task, determine the episode's start, such as the object's position."""
+        """Numbers (n,) that, with the task, determine the episode's start, such as the object's position."""
 
     @property
     def observation(self) -> Observation:
@@ -394,10 +347,9 @@ class World(ABC):
         return float(values[names.index("gripper")]) if "gripper" in names else 1.0
 
     def reset(self, seed: int) -> Observation:
-        """Start the episode of a seed, and return the first observation. A stress draws a new disturbance.
+        """Start the episode of a seed of 0 or more, and return the first observation.
 
-        Raises:
-            UsageError: The seed is negative.
+        A stress draws a new disturbance.
         """
         if seed < 0:
             raise UsageError(f"episode seed must be 0 or more, not {seed}")
@@ -448,22 +400,12 @@ class World(ABC):
         return self._picture(self.camera if camera is None else self.spec.camera(camera), stressed=False)
 
     def observe(self, cameras: Sequence[str]) -> Observation:
-        """Return the latest observation with new images.
-
-        Args:
-            cameras: Names of the views to draw. No other view is drawn.
-        """
+        """Return the latest observation with new images of these views. No other view is drawn."""
         seen = self.observation
         own = {name: self.spec.camera(replace(self.camera, name=name)) for name in cameras}
         return seen.with_images({name: self._picture(camera, stressed=True) for name, camera in own.items()})
 
     def _picture(self, camera: CameraSettings, stressed: bool) -> NDArray[np.uint8]:
-        """Draw all views of a camera setting side by side.
-
-        Args:
-            camera: The views and their size.
-            stressed: Whether the stress may change the image.
-        """
         parts = []
         for view in views_of(camera.name):
             image = self._draw(replace(camera, name=view.camera, fovy=view.fovy or camera.fovy))

@@ -43,7 +43,7 @@ class ModelChanges(ExitStack):
     """Remembers the original values of arrays of a MuJoCo model. `close` restores them, the last change first."""
 
     def keep(self, *arrays: NDArray[Any]) -> None:
-        """Remember the current values of some arrays of a model. Call this method before changing the arrays."""
+        """Remember the current values of arrays of a model. Call this method before changing them."""
         for array in arrays:
             self.callback(np.copyto, array, array.copy())
 
@@ -69,13 +69,7 @@ class Stress:
         self.amount: Any = self.levels[level - 1] if level else None
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """Prepare an episode, before its reset.
-
-        Args:
-            task: Full name of the task.
-            seed: Seed of the episode.
-            space: Action space of the actions that `act` receives.
-        """
+        """Prepare an episode of a task (full name) before its reset. `act` receives actions of this space."""
         self._task, self._seed = task, seed
 
     def generator(self, purpose: str = "", step: int = 0) -> np.random.Generator:
@@ -89,30 +83,17 @@ class Stress:
         return np.random.default_rng([self._seed, step, *text.encode()])
 
     def change(self, model: Model, changes: ModelChanges) -> None:
-        """Change the MuJoCo model of an episode after its reset.
-
-        Args:
-            model: The model.
-            changes: Remembers original values. Call `changes.keep` with each array before changing the array.
-        """
+        """Change the MuJoCo model after a reset. Call `changes.keep` with each array before changing it."""
 
     def act(self, action: Array, step: int) -> Array:
-        """Return the action (D,) to execute. It is called once per control step, in order.
+        """Return the action (D,) to execute, given the policy's (D,) within the limits.
 
-        Args:
-            action: (D,) what the policy wants to execute, clipped to the limits.
-            step: Control step.
+        Called once per control step, in order.
         """
         return action
 
     def see(self, camera: str, image: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
-        """Return the image (size, size, 3) that the policy sees.
-
-        Args:
-            camera: Name of the view.
-            image: The undisturbed image.
-            step: Control step.
-        """
+        """Return what the policy sees of an undisturbed image (size, size, 3). `camera` is the name of the view."""
         return image
 
 
@@ -120,11 +101,6 @@ NO_STRESS = Stress()
 
 
 def build(settings: StressSettings) -> Stress:
-    """Return the stress that the settings describe. At level 0 it changes nothing.
-
-    Raises:
-        UnknownName: There is no such kind.
-    """
     if not settings.active:
         return NO_STRESS
     return StressPart.find(settings.kind).built(settings.level)
@@ -144,7 +120,6 @@ class Light(Stress):
     levels = ((1.1, 10), (1.2, 15), (1.3, 20), (1.8, 45))
 
     def change(self, model: Model, changes: ModelChanges) -> None:
-        """Scale the strength of all lights. Rotate each lamp's position and direction."""
         gain, degrees = self.amount
         random, head = self.generator(), model.vis.headlight
         lights = (model.light_ambient, model.light_diffuse, model.light_specular)
@@ -173,13 +148,9 @@ def bursts(
 ) -> Iterator[tuple[bool, bool]]:
     """Yield two booleans for each control step: whether a burst is running, and whether it begins in this step.
 
-    Bursts have a fixed duration and begin at random, one at a time.
-
     Args:
-        random: Random generator. In each control step without a burst, one draw decides whether a burst begins.
         per_second: Mean number of bursts that begin per second while no burst is running.
         seconds: Duration of a burst.
-        control_hz: Control steps per second.
     """
     left = 0
     while True:
@@ -200,7 +171,6 @@ class Push(Stress):
     levels = (2.0, 4.0, 8.0, 14.0)
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """Prepare the random numbers of an episode."""
         super().begin(task, seed, space)
         self._random = self.generator()
         self._bursts = bursts(self._random, self.amount, PUSH_SECONDS, space.control_hz)
@@ -209,7 +179,6 @@ class Push(Stress):
         self._push = self._middle
 
     def act(self, action: Array, step: int) -> Array:
-        """Return the action. During a push, the push replaces the action's position part."""
         runs, begins = next(self._bursts)
         if begins:
             self._push = self._middle + unit_vector(self._random, len(self._half)) * self._half
@@ -235,15 +204,10 @@ class Sensor(Stress):
     levels = ((16, 0.5, 0.1), (22, 0.65, 0.15), (30, 0.9, 0.2), (97, 3.0, 0.55))
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
-        """Prepare an episode: forget the images of the previous episode."""
         super().begin(task, seed, space)
         self._last: dict[str, NDArray[np.uint8]] = {}
 
     def see(self, camera: str, image: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
-        """Return the blurred and noisy image, or this camera's previous image.
-
-        Repeated calls in the same control step use the same random numbers.
-        """
         from scipy.ndimage import gaussian_filter
 
         noise, blur, dropped = self.amount

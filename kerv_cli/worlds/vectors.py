@@ -15,10 +15,10 @@ _SPLIT = 2.0**27 + 1.0  # Dekker's constant: splits a double into two halves who
 
 
 def length(vector: NDArray[np.float64]) -> float:
-    """Return the length of a vector (n,).
+    """Return the length of a vector (n,), each of whose squares is computed and added with a single rounding.
 
-    Each square is computed and added with a single rounding (fused multiply-add). OpenBLAS worked like this on the CPUs
-    that recorded the first datasets (AVX-512, up to 31 numbers). So those datasets can be recorded again bit by bit.
+    OpenBLAS worked like this on the CPUs that recorded the first datasets (AVX-512, up to 31 numbers). So those
+    datasets can be recorded again bit by bit.
     """
     total = 0.0
     for number in vector.tolist():
@@ -30,6 +30,5 @@ def length(vector: NDArray[np.float64]) -> float:
 
 
 def unit_vector(random: np.random.Generator, size: int) -> NDArray[np.float64]:
-    """Return a vector (size,) of length 1 in a uniformly random direction."""
     drawn = random.normal(size=size)
     return np.asarray(drawn / length(drawn))

@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 from kerv_cli.base.errors import UsageError
 
-VIEWS = "+"
-"""Joins the views in a camera's name."""
+VIEWS = "+"  # joins the views in a camera's name
 _VIEW = re.compile(r"(?P<camera>[^:@]+)(:(?P<fovy>\d{1,3}(\.\d{1,3})?))?", re.ASCII)
 
 
@@ -20,7 +19,6 @@ class View(NamedTuple):
 
     Attributes:
         name: This view's part of the full camera name, such as `gripperPOV:75` in `corner4+gripperPOV:75`.
-        camera: Name of the camera.
         fovy: Vertical field of view in degrees. If None, the camera settings decide.
     """
 
@@ -30,12 +28,7 @@ class View(NamedTuple):
 
 
 def views_of(name: str) -> list[View]:
-    """Parse a camera's name into its views, from left to right.
-
-    Args:
-        name: One or more views joined by `+`. A view is NAME or NAME:DEGREES, where DEGREES is its vertical field of
-            view. An empty name means one view of the environment's first camera.
-    """
+    """Parse a camera's name into its views, from left to right. An empty name is one view of the first camera."""
     views = [] if name else [View("", "", None)]
     for part in name.split(VIEWS) if name else ():
         match = _VIEW.fullmatch(part)
@@ -50,10 +43,4 @@ def views_of(name: str) -> list[View]:
 
 
 def frame_shape(name: str, size: int) -> tuple[int, int, int]:
-    """Return the shape (size, size x views, 3) of an image: height, width, colours.
-
-    Args:
-        name: Name of the camera, with its views joined by `+`.
-        size: Height and width of each view in pixels.
-    """
     return size, size * len(views_of(name)), 3

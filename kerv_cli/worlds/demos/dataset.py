@@ -17,24 +17,18 @@ from kerv_cli.worlds import EnvironmentPart, Task, stands_for_tasks
 from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames, load_episode, save_episode
 from kerv_cli.worlds.spec import EnvironmentSpec
 
-OnProgress = Callable[[int, int], object]
-"""Function that reports progress. It is called with (done, total) after every episode or batch."""
+OnProgress = Callable[[int, int], object]  # called with (done, total) after every episode or batch
 
-FORMAT = 2
-"""Version of the manifest's format."""
+FORMAT = 2  # of the manifest
 
 
 @dataclass(frozen=True)
 class EpisodeEntry:
-    """One episode in the manifest of a dataset.
+    """One episode in the manifest of a dataset. `bytes` and `sha256` are of its file.
 
     Attributes:
-        seed: Seed of the episode.
-        perturbed: Whether noise was added to the executed actions, or an actor (such as a policy) moved the robot
-            instead of the expert.
+        perturbed: Whether noise was added to the executed actions, or an actor moved the robot instead of the expert.
         steps: Number of control steps, up to the success.
-        bytes: Size of the episode's file.
-        sha256: Hash of the episode's file.
     """
 
     seed: int
@@ -45,26 +39,18 @@ class EpisodeEntry:
 
     @classmethod
     def saved(cls, folder: Path, episode: DemoEpisode, level: int = 6) -> EpisodeEntry:
-        """Write an episode to its file in a dataset's folder, and return its entry. `save_episode` explains `level`."""
         path = episode_path(folder, episode.task, episode.seed)
         save_episode(path, episode, level)
         return cls.of(path, episode)
 
     @classmethod
     def of(cls, path: Path, episode: DemoEpisode) -> EpisodeEntry:
-        """Return the entry for an episode that was saved to `path`."""
         return cls(episode.seed, episode.perturbed, episode.steps, path.stat().st_size, sha256_of(path))
 
 
 @dataclass(frozen=True)
 class TaskEntry:
-    """The episodes of one task in a manifest.
-
-    Attributes:
-        episodes: Recorded episodes, sorted by seed.
-        mean_steps: Mean number of control steps until success.
-        failed_seeds: Seeds in which the expert did not succeed.
-    """
+    """The episodes of one task in a manifest, sorted by seed. In `failed_seeds` the expert did not succeed."""
 
     episodes: tuple[EpisodeEntry, ...]
     mean_steps: float = 0.0
@@ -76,16 +62,10 @@ class DemoManifest:
     """The manifest of a dataset: what was recorded (docs/formats.md).
 
     Attributes:
-        format: Version of the manifest's format.
-        environment: Name of the environment.
-        actions: Action space of the environment.
-        observation: Observation space of the environment.
         config: Fields of `DemoConfig` without `workers`.
-        tasks: The episodes of each task.
         sha256: Hash over the hashes of all episode files.
         versions: Versions of the packages on which physics and images depend.
         seeds: The smallest and the largest seed, with the keys `first` and `last`.
-        episodes: Number of recorded episodes.
         missing: Number of requested episodes that could not be recorded because experts failed.
         instructions: The instruction of each task. Only for imported data, whose tasks belong to no registered
             environment.
@@ -106,7 +86,7 @@ class DemoManifest:
 
 
 def _facts(manifest: DemoManifest) -> dict[str, Any]:
-    """Return the facts that must be equal in all datasets that are joined, by name."""
+    # must be equal in all datasets that are joined
     spaces = {"action space": manifest.actions, "observation space": manifest.observation}
     return {"environment": manifest.environment, **spaces, "camera": manifest.config["camera"]}
 
@@ -114,14 +94,9 @@ def _facts(manifest: DemoManifest) -> dict[str, Any]:
 def register_recorded(
     name: str, actions: ActionSpace, observation: ObservationSpace, instructions: Mapping[str, str], camera: str
 ) -> EnvironmentSpec:
-    """Register an environment for a dataset that was imported. Nothing can be executed in such an environment.
+    """Register an environment for imported data, in which nothing can be executed.
 
-    Args:
-        name: Name of the environment. The same name in capitals stands for the suite of all tasks.
-        actions: Action space.
-        observation: Observation space.
-        instructions: The instruction of each task.
-        camera: Name of the recorded view.
+    Its name in capitals is a suite of all tasks.
     """
     tasks = {task: Task(task, instruction, "recorded") for task, instruction in instructions.items()}
     suites = {name.upper(): tuple(tasks)}
@@ -131,7 +106,6 @@ def register_recorded(
 
 
 def check_recorded(name: str) -> None:
-    """Check that imported data can be registered as an environment with this name."""
     part = EnvironmentPart.every().get(name)
     if part is not None and part.module != __name__:
         raise UsageError(
@@ -141,22 +115,11 @@ def check_recorded(name: str) -> None:
 
 
 def episode_path(folder: Path, task: str, seed: int) -> Path:
-    """Return the file of an episode.
-
-    Args:
-        folder: The dataset's folder.
-        task: Full name of the task.
-        seed: Seed of the episode.
-    """
     return folder / "episodes" / task / f"{seed:06d}.safetensors"
 
 
 def dataset_hash(tasks: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a text with one line per episode: its task, its seed and the hash of its file.
-
-    Args:
-        tasks: The value of the key `tasks` in a manifest's JSON.
-    """
+    """Return the SHA-256 of a text with a line per episode: its task, its seed and the hash of its file."""
     digest = hashlib.sha256()
     for task, summary in sorted(tasks.items()):
         for episode in summary["episodes"]:
@@ -167,13 +130,6 @@ def dataset_hash(tasks: Mapping[str, Any]) -> str:
 def totals(
     entries: Mapping[str, Sequence[EpisodeEntry]], failed: Mapping[str, Sequence[int]], missing: int
 ) -> dict[str, Any]:
-    """Return those fields of a manifest that summarise the episodes, as JSON values.
-
-    Args:
-        entries: The recorded episodes of each task.
-        failed: For each task the seeds in which the expert failed.
-        missing: Number of requested episodes that could not be recorded.
-    """
     tasks, seeds = {}, []
     for task, rows in entries.items():
         seeds += [entry.seed for entry in rows]
@@ -191,12 +147,7 @@ def totals(
 
 @dataclass(frozen=True)
 class DemoEntry(EpisodeEntry):
-    """An episode of a dataset on disk.
-
-    Attributes:
-        task: Full name of the task.
-        path: File of the episode.
-    """
+    """An episode of a dataset on disk."""
 
     task: str
     path: Path
@@ -207,11 +158,8 @@ class DemoDataset:
     """A complete set of recorded demonstrations on disk.
 
     Attributes:
-        path: The dataset's folder.
-        manifest: What was recorded.
         episodes: One entry per episode, sorted by dataset if several were joined, then by task, then by seed.
-        views: If images show several views side by side, read only this number of them, from the left. If 0,
-            read all.
+        views: If images show several views side by side, read only this number of them, from the left. If 0, read all.
     """
 
     path: Path
@@ -221,16 +169,11 @@ class DemoDataset:
 
     @property
     def sha256(self) -> str:
-        """Hash over the hashes of all episode files. Equal hashes mean equal datasets."""
         return self.manifest.sha256
 
     @classmethod
     def open(cls, path: Path) -> DemoDataset:
-        """Open a dataset. Check that all files exist and have their full size. `load` checks their contents.
-
-        Args:
-            path: The dataset's folder.
-        """
+        """Open a dataset, and check that all files exist and have their full size. `load` checks their contents."""
         file = path / "manifest.json"
         if not file.exists():
             command = f"'kerv demos {'task' if stands_for_tasks(path.name) else 'name'}={path.name}'"
@@ -257,12 +200,7 @@ class DemoDataset:
 
     @classmethod
     def joined(cls, parts: Sequence[DemoDataset]) -> DemoDataset:
-        """Join several datasets into one.
-
-        Returns:
-            A dataset with all episodes, part by part. Its manifest is the first part's, with the tasks of all parts and
-            a hash over the hashes of the parts.
-        """
+        """Join datasets. The manifest is the first one's, with the tasks of all and a hash over their hashes."""
         if len(parts) == 1:
             return parts[0]
         first, ours = parts[0].manifest, _facts(parts[0].manifest)
@@ -279,11 +217,10 @@ class DemoDataset:
         return cls(parts[0].path, replace(first, sha256=combined, config=config, tasks=tasks), episodes)
 
     def of_tasks(self, *tasks: str) -> list[int]:
-        """Return the indices in `episodes` of all episodes of some tasks. `tasks` are full names."""
+        """Return the indices in `episodes` of all episodes of some tasks, given by full names."""
         return [index for index, entry in enumerate(self.episodes) if entry.task in tasks]
 
     def load(self, index: int) -> DemoEpisode:
-        """Read the episode at position `index` in `episodes`."""
         entry, path = self.episodes[index], self.episodes[index].path
         if sha256_of(path) != entry.sha256:
             raise CheckpointError(f"{path} changed since it was recorded: move it aside and run 'kerv demos' again")

@@ -28,31 +28,26 @@ from safetensors.numpy import save
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import atomic_path, regular
 
-FORMAT = "1"
-"""Version of the episode files' format."""
+FORMAT = "1"  # of the episode files
+# same names in the file; `initial_state` is called `rand_vec` there
 _ARRAYS = ("frame_steps", "states", "labels", "executed")
-"""Arrays of an episode that have the same name in the file. `initial_state` is called `rand_vec` there."""
 
 
 @dataclass(frozen=True)
 class DemoEpisode:
-    """A demonstration of T control steps.
+    """A demonstration of T control steps, which ends with the first success.
 
-    The episode ends with the first success. If an actor (such as a policy) moved the robot instead of the expert,
-    the episode may end without success.
+    If an actor (such as a policy) moved the robot instead of the expert, the episode may end without success.
 
     Attributes:
-        task: Full name of the task.
-        seed: Seed of the episode.
         perturbed: Whether noise was added to the executed actions, or an actor moved the robot instead of the expert.
-        steps: T, the number of control steps.
-        frames: (n, size, size x views, 3) uint8, the recorded images. An episode that will only be saved may have an
-            iterator of images instead.
+        frames: (n, size, size x views, 3) uint8. An episode that will only be saved may have an iterator of images
+            instead.
         frame_steps: (n,) int64. Image i was drawn before the action of control step `frame_steps[i]`.
         states: (T, s) float32, privileged state before each action. It begins with the proprioception.
-        labels: (T + tail, D) float32, the expert's actions for D DoFs, clipped and without noise. The last `tail`
-            actions come after the episode's end. The expert executed them. In imported data, they are copies of the
-            last recorded action.
+        labels: (T + tail, D) float32, the expert's actions for D DoFs, clipped and without noise. The expert executed
+            the last `tail` actions after the episode's end. In imported data, they are copies of the last recorded
+            action.
         executed: (T, D) float32, the actions that moved the robot.
         initial_state: (k,) float64, the world's `initial_state`, such as the placement of object and goal.
     """
@@ -70,19 +65,14 @@ class DemoEpisode:
 
     @property
     def end_effector(self) -> NDArray[np.float32]:
-        """Position of the end effector before each action, (T, 3) float32, in metres."""
+        """Position before each action, (T, 3) float32, in metres."""
         return self.states[:, :3]
 
 
 def save_episode(path: Path, episode: DemoEpisode, level: int = 6) -> None:
-    """Write an episode to a file, atomically.
-
-    The PNG files of all images are stored end to end in one tensor. Another tensor holds the n + 1 byte offsets of the
-    n files. Memory holds one image at a time: the PNG files wait in a temporary file until their sizes are known.
+    """Write an episode to a file, atomically (docs/formats.md). Memory holds one image at a time.
 
     Args:
-        path: The file.
-        episode: The episode.
         level: Compression of the images, from 1 (five times as fast, 7 % more bytes) to 9. Equal recordings must have
             equal bytes, so recordings always use the default.
     """
@@ -129,7 +119,6 @@ def save_episode(path: Path, episode: DemoEpisode, level: int = 6) -> None:
 
 
 def load_episode(path: Path) -> DemoEpisode:
-    """Read an episode from a file."""
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
@@ -172,7 +161,6 @@ class EncodedFrames:
 
     @classmethod
     def joined(cls, parts: Sequence[EncodedFrames]) -> EncodedFrames:
-        """Return the images of all parts, in order. All images must have the same size."""
         files: list[Path] = []
         spans = []
         for part in parts:
@@ -182,7 +170,6 @@ class EncodedFrames:
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
-        """Shape of the decoded images, (n, size, width, 3)."""
         return len(self), self.size, self.width, 3
 
     def __len__(self) -> int:
@@ -195,11 +182,7 @@ class EncodedFrames:
         return self.pixels().astype(dtype or np.uint8, copy=False)
 
     def __getitem__(self, chosen: Any) -> Any:
-        """Select images.
-
-        An integer returns one decoded image (size, width, 3). A slice, mask or indices return the selected images as
-        `EncodedFrames`, not decoded.
-        """
+        """Return one decoded image for an integer, else the selected images as `EncodedFrames`."""
         if isinstance(chosen, int | np.integer):
             return self._decode(int(chosen))
         rows = chosen if isinstance(chosen, slice) else np.asarray(chosen)
@@ -216,7 +199,6 @@ class EncodedFrames:
             return np.stack(list(pool.map(self._decode, range(len(self)))))
 
     def _decode(self, i: int) -> NDArray[np.uint8]:
-        """Return the decoded image number i."""
         file_index, start, end = self.spans[i].tolist()
         with self.files[file_index].open("rb") as file:
             file.seek(start)
@@ -226,21 +208,18 @@ class EncodedFrames:
 
 
 def encode_png(frame: NDArray[np.uint8], level: int = 6) -> bytes:
-    """Return an image (height, width, 3) uint8 as a PNG file. `level` is the compression, from 1 (fast) to 9."""
     buffer = io.BytesIO()
     Image.fromarray(frame).save(buffer, format="PNG", compress_level=level)
     return buffer.getvalue()
 
 
-MOST_EXPANDED = 2**30
-"""Largest size of a table in memory, in bytes."""
+MOST_EXPANDED = 2**30  # bytes of a table in memory
 
 
 def foreign_table(source: Path | bytes, columns: Sequence[str] = ()) -> pa.Table:
-    """Read a table from a Parquet file that another program wrote. It may be small on disk and huge in memory.
+    """Read a Parquet file that another program wrote. It may be small on disk and huge in memory.
 
     Args:
-        source: The file's path or its bytes.
         columns: Names of the columns to read. Names that the file lacks are ignored. If empty, read all columns.
     """
     total, name = 0, "a table" if isinstance(source, bytes) else str(source)

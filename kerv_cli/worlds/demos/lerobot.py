@@ -40,14 +40,12 @@ VIDEO = f"videos/{{video_key}}/{CHUNK}.mp4"
 STATE, ENVIRONMENT, ACTION, EXECUTED = "observation.state", "observation.environment_state", "action", "action.executed"
 IMAGES = "observation.images."
 VECTORS = (ACTION, EXECUTED, STATE, ENVIRONMENT)
-MOST_NUMBERS = 65_536
-"""Largest number of values in the action or the state of one control step."""
+MOST_NUMBERS = 65_536  # in the action or the state of one control step
 OPENVLA = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
 # PIL raises SyntaxError
 _DAMAGE = (OSError, ValueError, KeyError, TypeError, SyntaxError, Image.DecompressionBombError, pa.ArrowException)
 
-Row: TypeAlias = Mapping[str, Any]
-"""A row of a table, or an object of a JSON file."""
+Row: TypeAlias = Mapping[str, Any]  # of a table, or an object of a JSON file
 
 
 @dataclass(frozen=True)
@@ -57,8 +55,7 @@ class Source:
     Attributes:
         info: Contents of meta/info.json.
         episodes: Rows of the tables in meta/episodes.
-        tasks: The instructions by `task_index`, the number of a task.
-        camera: Name of the camera to read.
+        tasks: The instructions by `task_index`.
         key: Name of the feature with the camera's images.
     """
 
@@ -124,18 +121,11 @@ class Source:
         return [str(name) for name in names]
 
     def path(self, episode: Row, columns: str, form: str) -> Path:
-        """Return the path of a data or video file of an episode.
-
-        Args:
-            episode: The episode's row in meta/episodes.
-            columns: What the row's two columns that number the file begin with, such as `data`.
-            form: Template of the path, such as `DATA`.
-        """
+        """Return a data or video file of an episode. `columns` is the start of the two columns that number the file."""
         indices = {f"{x}_index": int(episode[f"{columns}/{x}_index"]) for x in ("chunk", "file")}
         return self.folder / form.format(video_key=self.key, **indices)
 
     def data_path(self, episode: Row) -> Path:
-        """Return the path of the data file of an episode."""
         return self.path(episode, "data", self.info.get("data_path") or DATA)
 
     def frames(self, episode: Row, table: pa.Table) -> Iterator[np.ndarray]:
@@ -148,7 +138,6 @@ class Source:
 
 
 def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProgress) -> DemoDataset:
-    """Convert a LeRobot dataset to demonstrations in a new folder, and open them."""
     if folder.exists():
         raise UsageError(f"{folder} exists: give the new demonstrations another name")
     path = as_path(settings.source)
@@ -162,7 +151,6 @@ def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProg
 
 
 def _import(source: Source, settings: DemosImportSettings, folder: Path, progress: OnProgress) -> None:
-    """Write the demonstrations into an empty folder."""
     world = _world_of(source, settings)
     names = _task_names(source.tasks, world)
     environment = world.name if world else settings.name or source.folder.name
@@ -211,7 +199,6 @@ def _import(source: Source, settings: DemosImportSettings, folder: Path, progres
 
 
 def _world_of(source: Source, settings: DemosImportSettings) -> EnvironmentSpec | None:
-    """Return the environment that the data were recorded in. None if the setting `environment` is empty."""
     if not settings.environment:
         return None
     spec: EnvironmentSpec = EnvironmentPart.find(settings.environment).built()
@@ -226,13 +213,6 @@ def _world_of(source: Source, settings: DemosImportSettings) -> EnvironmentSpec 
 
 
 def _observation(source: Source, state: int, world: EnvironmentSpec) -> ObservationSpace:
-    """Return the environment's observation space, or only its proprioception if the dataset has no more.
-
-    Args:
-        source: The dataset.
-        state: Number of state values in each row of the dataset.
-        world: The environment.
-    """
     whole, alone = world.observation, world.observation.without_state()
     if state in (whole.state, alone.state):
         return whole if state == whole.state else alone
@@ -243,16 +223,6 @@ def _observation(source: Source, state: int, world: EnvironmentSpec) -> Observat
 
 
 def _episode(source: Source, row: Row, path: Path, table: pa.Table, names: Mapping[int, str], tail: int) -> DemoEpisode:
-    """Convert one episode.
-
-    Args:
-        source: The LeRobot dataset.
-        row: The episode's row in meta/episodes.
-        path: The data file of the episode.
-        table: The rows of that file.
-        names: The names of the tasks by `task_index`.
-        tail: Number of copies of the last action to append to the labels.
-    """
     number, length = int(row["episode_index"]), int(row["length"])
     table = table.filter(pc.equal(table["episode_index"], number))
     if not 0 < len(table) == length:
@@ -281,13 +251,7 @@ def _episode(source: Source, row: Row, path: Path, table: pa.Table, names: Mappi
 
 
 def action_space(source: Source, settings: DemosImportSettings, actions: np.ndarray) -> ActionSpace:
-    """Return the action space of a LeRobot dataset.
-
-    Args:
-        source: The dataset.
-        settings: Names of the DoFs, and strict DoFs (such as a gripper).
-        actions: (n, D) actions, among them the smallest and largest of each DoF, which become the limits.
-    """
+    """Return the action space of a dataset, limited by the smallest and largest of some actions (n, D)."""
     names = tuple(source.names(ACTION, "action"))
     if settings.dofs == "openvla":
         if len(names) != len(OPENVLA):
@@ -303,10 +267,6 @@ def action_space(source: Source, settings: DemosImportSettings, actions: np.ndar
 
 
 def _groups(names: Sequence[str], strict: Sequence[str]) -> tuple[Group, ...]:
-    """Divide the DoFs into groups: position, rotation and gripper if only the last of seven DoFs is strict.
-
-    Otherwise, neighbouring DoFs of the same sort (strict or not strict) form one group.
-    """
     if len(names) == 7 and tuple(strict) == tuple(names[-1:]):
         return Group("position", 3), Group("rotation", 3), Group("gripper", 1)
     groups, sorts = [], {True: "strict", False: "motion"}
@@ -316,11 +276,6 @@ def _groups(names: Sequence[str], strict: Sequence[str]) -> tuple[Group, ...]:
 
 
 def _task_names(tasks: Mapping[int, str], world: EnvironmentSpec | None) -> dict[int, str]:
-    """Return the names of a dataset's tasks by `task_index`.
-
-    They are those of the environment's tasks with the same instructions. Without an environment, they are made from the
-    instructions.
-    """
     if world:
         known = {task.instruction: task.name for task in reversed([*world.tasks.values()])}  # the first of equals
         for text in tasks.values():
@@ -337,7 +292,6 @@ def _task_names(tasks: Mapping[int, str], world: EnvironmentSpec | None) -> dict
 
 @contextlib.contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Turn an error inside the `with` block into a CheckpointError that names the file that is read."""
     try:
         yield
     except _DAMAGE as error:
@@ -352,7 +306,7 @@ def _table(path: Path, columns: Sequence[str]) -> pa.Table:
 
 
 def _vectors(table: pa.Table, name: str) -> np.ndarray:
-    """Return the numbers (T, n) float32 of a column, whose rows may be lists of lists."""
+    # (T, n) float32; the rows of a column may be lists of lists
     part, rows = table[name].combine_chunks(), len(table)
     while pa.types.is_nested(part.type):
         lengths = pc.unique(pc.list_value_length(part)).to_pylist()
@@ -363,7 +317,7 @@ def _vectors(table: pa.Table, name: str) -> np.ndarray:
 
 
 def _pictures(cells: pa.ChunkedArray, folder: Path, path: Path) -> Iterator[np.ndarray]:
-    """Yield the image (height, width, 3) uint8 of each cell, which holds its bytes or its path below `folder`."""
+    # a cell holds the image's bytes or its path below `folder`
     for cell in cells:
         value = cell.as_py()
         data = value.get("bytes")
@@ -373,14 +327,7 @@ def _pictures(cells: pa.ChunkedArray, folder: Path, path: Path) -> Iterator[np.n
 
 
 def _video_frames(path: Path, start: float, rate: float, count: int) -> Iterator[np.ndarray]:
-    """Yield the frames (height, width, 3) uint8 of a video that are nearest to the times start, start + 1 / rate, ….
-
-    Args:
-        path: The video.
-        start: First time, in seconds.
-        rate: Frames per second.
-        count: Number of frames.
-    """
+    # the frames nearest to the times start, start + 1 / rate, … in seconds
     try:
         import av
     except ImportError as error:

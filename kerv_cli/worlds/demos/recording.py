@@ -41,8 +41,7 @@ from kerv_cli.worlds.spec import EnvironmentSpec, World
 from kerv_cli.worlds.vectors import unit_vector
 
 _SEEDS_PER_JOB = 10  # seeds of a job share one simulator
-_EXTRA_SEEDS = 20
-"""A task gets at most this many further seeds, plus one per requested episode, to replace failed seeds."""
+_EXTRA_SEEDS = 20  # of a task, plus one per requested episode, to replace failed seeds
 
 
 @dataclass(frozen=True)
@@ -50,16 +49,13 @@ class DemoConfig:
     """What to record.
 
     Attributes:
-        tasks: Tasks and suites of one environment.
         episodes: Number of successful episodes per task.
         first_seed: First seed of every task. It must be a training seed.
         perturbed: Share of episodes that are executed with noise. `is_perturbed` chooses these episodes.
-        camera: View of the recorded images. Default: the environment's first camera.
         frame_stride: Record an image at every n-th control step.
         tail: Number of labels to record after the success. Action chunks that begin near the end need them.
         workers: Number of processes. The result does not depend on it.
-        horizon: Number of control steps within which the expert must succeed. 0 stands for the environment's
-            default.
+        horizon: Control steps within which the expert must succeed. 0 stands for the environment's default.
         policy: Hash of the actor's method and weights. Empty if the expert moves the robot.
         expert_share: Probability that the expert, not the actor, executes a chunk of actions.
     """
@@ -87,7 +83,6 @@ class DemoConfig:
 
     @property
     def spec(self) -> EnvironmentSpec:
-        """Environment of the tasks."""
         return spec_of(self.tasks[0])
 
 
@@ -98,29 +93,18 @@ class Actor(Protocol):
         """Begin an episode, after the world was reset."""
 
     def act(self, label: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the action (D,) to execute now.
-
-        Args:
-            label: (D,) the expert's action in this state.
-        """
+        """Return the action (D,) to execute now. `label` (D,) is the expert's action in this state."""
 
 
-MakeActor = Callable[[DemoConfig], Actor]
-"""Creates the actor in the process that records. The function must be picklable."""
+MakeActor = Callable[[DemoConfig], Actor]  # called in the process that records, so it must be picklable
 
 
 def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None) -> DemoEpisode | None:
     """Run one episode and label every state with the expert's action.
 
-    Args:
-        world: World of the task.
-        seed: Seed of the episode.
-        config: What to record.
-        actor: Moves the robot. If None, the expert moves it.
-
     Returns:
         The episode. None if the expert did not succeed within `config.horizon` control steps, or not early enough for
-        the simulator to run the `config.tail` steps after the success. An actor's episode is always returned.
+            the simulator to run the `config.tail` steps after the success. An actor's episode is always returned.
     """
     expert = world.spec.expert(world.task)
     observation = world.reset(seed)
@@ -166,19 +150,10 @@ def record(
     on_progress: OnProgress = lambda done, total: None,
     make_actor: MakeActor | None = None,
 ) -> DemoManifest:
-    """Record demonstrations into a folder. If the recording was interrupted, continue it.
+    """Record demonstrations into a folder, or continue an interrupted recording.
 
     If the expert fails for a seed, the next seed after the requested range replaces it. If too many seeds fail, the
     dataset has fewer episodes than requested. The recorded episodes do not depend on the number of workers.
-
-    Args:
-        config: What to record.
-        out: The dataset's folder.
-        on_progress: Called after every few episodes.
-        make_actor: Creates the actor that moves the robot. If None, the expert moves it.
-
-    Returns:
-        The manifest, as written to `out/manifest.json`.
     """
     config.spec.check_installed()
     choose_backend()
@@ -198,12 +173,6 @@ def record(
 def _collect(
     config: DemoConfig, out: Path, on_progress: OnProgress, make_actor: MakeActor | None
 ) -> tuple[dict[str, list[EpisodeEntry]], dict[str, list[int]]]:
-    """Record all episodes. For each seed in which the expert fails, record a further seed.
-
-    Returns:
-        Two dictionaries by task: the manifest's entries of the task's episodes, and the seeds in which the expert
-        failed.
-    """
     entries: dict[str, list[EpisodeEntry]] = {task: [] for task in config.tasks}
     failed: dict[str, list[int]] = {task: [] for task in config.tasks}
     seeds = dict.fromkeys(config.tasks, range(config.first_seed, config.first_seed + config.episodes))
@@ -228,7 +197,6 @@ def _collect(
 
 
 def _identity(config: DemoConfig) -> dict[str, Any]:
-    """Return the manifest's fields that are known before the recording, as JSON values."""
     settings = asdict(config) | {"noise_low": SIGMA[0], "noise_high": SIGMA[1], "burst_probability": BURST_PROBABILITY}
     del settings["workers"]
     spec = config.spec
@@ -247,14 +215,9 @@ def _identity(config: DemoConfig) -> dict[str, Any]:
 
 
 def check_recording(config: DemoConfig, out: Path) -> dict[str, Any]:
-    """Refuse a folder that holds demonstrations of another configuration.
+    """Refuse a folder with demonstrations of another configuration.
 
-    Args:
-        config: What to record.
-        out: The dataset's folder. It need not exist.
-
-    Returns:
-        The manifest's fields that are known before the recording, as JSON values.
+    Return the manifest's fields that are known before the recording, as JSON values.
     """
 
     def flat(one: dict[str, Any]) -> dict[str, Any]:
@@ -279,7 +242,6 @@ _Outcomes = dict[int, EpisodeEntry | None]  # seed -> the manifest's entry, None
 def _run_jobs(
     config: DemoConfig, out: Path, jobs: Sequence[tuple[str, range]], make_actor: MakeActor | None
 ) -> Iterator[tuple[str, _Outcomes]]:
-    """Record all jobs, each a task with some seeds, in several processes. Yield the results as they come."""
     if config.workers == 1 or len(jobs) == 1:
         yield from (_record_seeds(config, out, task, seeds, make_actor) for task, seeds in jobs)
         return
@@ -298,11 +260,6 @@ def _run_jobs(
 def _record_seeds(
     config: DemoConfig, out: Path, task: str, seeds: Sequence[int], make_actor: MakeActor | None
 ) -> tuple[str, _Outcomes]:
-    """Record a task's episodes for these seeds, except those that are on disk already. Runs in a worker process.
-
-    Returns:
-        The task's name, and for each seed the manifest's entry of the episode, or None if the expert failed.
-    """
     actor, outcomes = make_actor(config) if make_actor else None, _Outcomes()
     with config.spec.open_world(task, config.camera) as world:
         for seed in seeds:
@@ -322,40 +279,23 @@ def _record_seeds(
     return task, outcomes
 
 
-SIGMA = 0.2, 0.6
-"""Lowest and highest standard deviation of the Gaussian noise, where 1 is half of a DoF's range."""
-BURST_PROBABILITY = 0.02
-"""Probability that a burst of noise begins in a control step."""
+SIGMA = 0.2, 0.6  # lowest and highest standard deviation of the Gaussian noise; 1 is half of a DoF's range
+BURST_PROBABILITY = 0.02  # of a burst's begin, per control step
 
 
 def is_perturbed(seed: int, fraction: float) -> bool:
-    """Return whether the episode of a seed is executed with noise. The seeds with noise are spread evenly.
-
-    Args:
-        seed: Seed of the episode.
-        fraction: Share of episodes with noise.
-    """
+    """Return whether the episode of a seed is executed with noise. The seeds with noise are spread evenly."""
     return int((seed + 1) * fraction) > int(seed * fraction)
 
 
 class Perturbation:
-    """Noise for the actions of one episode.
+    """Noise for the actions (D,) of one episode, which stay within the limits.
 
     The noise is Gaussian. Now and then, for 3 to 8 control steps, a burst in one random direction replaces the action.
     Strict DoFs (such as a gripper) are not changed.
-
-    Attributes:
-        sigma: Standard deviation of the Gaussian noise in this episode, where 1 is half of a DoF's range.
     """
 
     def __init__(self, task: str, seed: int, space: ActionSpace) -> None:
-        """Draw the noise of an episode from its task and seed.
-
-        Args:
-            task: Full name of the task.
-            seed: Seed of the episode.
-            space: Action space of the actions.
-        """
         self._random = np.random.default_rng([seed, *task.encode()])
         self.sigma = float(self._random.uniform(*SIGMA))
         self._burst_left = 0
@@ -365,11 +305,6 @@ class Perturbation:
         self._direction = np.zeros(len(self._half))  # normalised
 
     def __call__(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the noisy action (D,) to execute, clipped to the limits.
-
-        Args:
-            action: (D,) the expert's action.
-        """
         dofs = len(self._half)
         noise = self._random.normal(0.0, self.sigma, size=dofs)
         if self._burst_left == 0 and self._random.random() < BURST_PROBABILITY:

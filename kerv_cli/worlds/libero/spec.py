@@ -6,13 +6,9 @@ from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, Place
 from kerv_cli.worlds.libero.tasks import HORIZONS, SUITES, TASKS
 from kerv_cli.worlds.spec import EnvironmentSpec, Seeds
 
+# named in recordings and in the identity of `policy=expert`; increase the number if the experts' actions change
 EXPERTS = "kerv 1"
-"""Name of the experts in recordings and in the identity of `policy=expert`.
-
-It ends with a number. Increase the number if the experts' actions change.
-"""
-STATES = 50
-"""Initial states that the benchmark has for each task."""
+STATES = 50  # initial states that the benchmark has for each task
 _FIRST = 100_000
 
 SPEC = EnvironmentSpec(

@@ -12,15 +12,13 @@ from pathlib import Path
 
 from kerv_cli.worlds import Task
 
+# control steps of an episode in each suite, as in OpenVLA's and openpi's evaluation
 HORIZONS = {"spatial": 220, "object": 280, "goal": 300, "10": 520}
-"""Control steps of an episode in each suite, as in OpenVLA's and openpi's evaluation."""
+# endings of suites and tasks: the benchmark's own, then LIBERO-PRO's other places, looks, goals and words
 CHANGES = ("", "_swap", "_object", "_task", "_lan")
-"""Endings of suites and tasks: the benchmark's own, then LIBERO-PRO's: other places, other looks, another goal, other
-words."""
 
 TASKS: dict[str, Task] = {}
-FILES: dict[str, tuple[str, str]] = {}
-"""Folder and name of a task's files in the benchmark, without their endings."""
+FILES: dict[str, tuple[str, str]] = {}  # folder and name of a task's files, without endings
 SUITES: dict[str, tuple[str, ...]] = {}
 
 with Path(__file__).with_name("tasks.csv").open(encoding="utf-8") as _file:
@@ -35,5 +33,4 @@ for _change in CHANGES:
         FILES[_name] = f"libero_{_group}", _row["file"]
         SUITES[f"LIBERO_{_group}".upper()] = (*SUITES.get(f"LIBERO_{_group}".upper(), ()), _name)
 
-NAMES = (*SUITES, *TASKS)
-"""Names of suites and tasks, for shell completion."""
+NAMES = (*SUITES, *TASKS)  # for shell completion

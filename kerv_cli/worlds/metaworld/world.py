@@ -28,10 +28,7 @@ _TASKS_PER_BENCHMARK = 50
 
 @functools.lru_cache(maxsize=256)
 def _placements(task: str, benchmark_seed: int) -> tuple[Any, ...]:
-    """Return the 50 initial states (`metaworld.Task`) of `MT1(task, benchmark_seed)`.
-
-    A call takes up to 1 s, because Meta-World resets the task 100 times. Results are cached.
-    """
+    # initial states of MT1; up to 1 s, because Meta-World resets the task 100 times
     load_mujoco()
     import metaworld
 
@@ -54,7 +51,7 @@ class MetaWorld(MujocoWorld):
 
     @property
     def initial_state(self) -> NDArray[np.float64]:
-        """Placement of object and goal in this episode, (3,) or (6,) float64, in metres."""
+        """Placement of object and goal in this episode, (3,) or (6,), in metres."""
         self.observation  # noqa: B018 - raises before the first reset
         return np.array(self._env._last_rand_vec, dtype=np.float64)
 
@@ -87,7 +84,6 @@ class MetaWorld(MujocoWorld):
         return model, data
 
     def close(self) -> None:
-        """Free simulator and graphics. A later reset builds them again."""
         super().close()
         if self._env is not None:
             self._env.close()
@@ -98,7 +94,6 @@ class MetaWorldExpert:
     """Scripted controller of one task: Meta-World's own, or kerv's replacement (`OURS`)."""
 
     def __init__(self, spec: EnvironmentSpec, task: str) -> None:
-        """Find the controller of a task."""
         name = spec.task(task).name
         load_mujoco()
         from metaworld.policies import ENV_POLICY_MAP
@@ -107,14 +102,13 @@ class MetaWorldExpert:
         self._policy: Any = {**ENV_POLICY_MAP, **OURS}[name]()
 
     def __call__(self, observation: Observation) -> NDArray[np.float64]:
-        """Return the expert's action (4,), clipped to the limits. Without clipping, its numbers reach 25."""
+        # clipped, because the numbers of Meta-World's experts reach 25
         with _quiet_simulator():
             action = self._policy.get_action(observation.state)
         return np.clip(np.asarray(action, dtype=np.float64), *self._limits)
 
 
-GAIN = 15.0
-"""Action per metre of distance. Actions saturate at 1, which is reached at a distance of 7 cm."""
+GAIN = 15.0  # action per metre of distance; actions saturate at 1, at a distance of 7 cm
 
 
 class HandlePullSide:
@@ -125,19 +119,13 @@ class HandlePullSide:
     phase of the movement from the gripper's opening. So each action depends only on the current state.
     """
 
-    above = 0.1
-    """Height above the handle at which the hand approaches, in metres."""
+    above = 0.1  # metres above the handle at which the hand approaches
+    # horizontal metres from the handle: beyond `far` the hand rises, beyond `near` a raised hand stays up
     far, near = 0.04, 0.02
-    """Horizontal distances from the handle, in metres. Farther than `far` the hand rises. Farther than `near` a raised
-    hand stays up."""
-    slipped = 0.05
-    """Height of the hand above the handle beyond which the fingers do not hold it, in metres."""
-    low = 0.005
-    """Height of the hand above the handle at which the fingers close, in metres."""
-    shut = 0.66
-    """Opening of the gripper (0 closed, 1 open) below which the fingers hold the handle."""
-    lift = 0.4
-    """Upward action while lifting. It must be small: the handle's damping resists in proportion to the speed."""
+    slipped = 0.05  # metres above the handle beyond which the fingers do not hold it
+    low = 0.005  # metres above the handle at which the fingers close
+    shut = 0.66  # opening of the gripper (0 closed, 1 open) below which the fingers hold the handle
+    lift = 0.4  # upward action while lifting, small because the handle's damping grows with the speed
 
     def get_action(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the action (4,) for a state (39,), not clipped."""
@@ -162,23 +150,16 @@ class PegInsertSide:
     goes down to it with closed fingers and drags it along the table for the rest of the episode.
     """
 
-    above = 0.15
-    """Height above the peg at which the hand approaches, in metres."""
-    aside = 0.04
-    """Horizontal distance from the peg beyond which the hand first moves above the peg, in metres."""
-    held = 0.04
-    """Largest distance of the peg below the hand at which the fingers may hold the peg, in metres."""
+    above = 0.15  # metres above the peg at which the hand approaches
+    aside = 0.04  # horizontal metres from the peg beyond which the hand first moves above it
+    held = 0.04  # most metres of the peg below the hand at which the fingers may hold it
+    # openings of the gripper (1 is open): above `open` the hand may go down, below `shut` the fingers hold the peg
     open, shut = 0.6, 0.4
-    """Openings of the gripper (1 is open). Above `open` the hand may go down. Below `shut` the fingers hold the peg."""
-    aligned = 0.03
-    """Distance from the hole's axis within which the peg may be inserted, in metres."""
-    carry = 0.7
-    """Largest action while carrying the peg."""
-    before, behind, height = 0.05, -0.35, 0.16
-    """Goals of the hand in metres: x before the hole, x beyond the hole, and height z."""
+    aligned = 0.03  # metres from the hole's axis within which the peg may be inserted
+    carry = 0.7  # largest action while carrying the peg
+    before, behind, height = 0.05, -0.35, 0.16  # goals of the hand in metres: x before the hole, x beyond it, height z
 
     def get_action(self, state: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the action (4,) for a state (39,), not clipped."""
         hand, opening, peg, hole = state[:3], state[3], state[4:7], state[37]
         below = float(hand[2] - peg[2])
         gripper, most = -1.0, 1.0
@@ -197,14 +178,10 @@ class PegInsertSide:
         return np.array([*(go * min(1.0, most / float(np.abs(go).max()))), gripper])
 
 
+# named in recordings and in the identity of `policy=expert`; increase the number if the experts' actions change
 VERSION = "kerv 1"
-"""Name of these experts in recordings and in the identity of `policy=expert`.
-
-It ends with a number. Increase the number if the experts' actions change.
-"""
 
 OURS: Mapping[str, Callable[[], HandlePullSide | PegInsertSide]] = {
     "handle-pull-side-v3": HandlePullSide,
     "peg-insert-side-v3": PegInsertSide,
 }
-"""Class of the expert that replaces Meta-World's expert, by task."""
