@@ -302,6 +302,22 @@ def test_an_interface_of_ones_own_runs_as_the_docs_show(tmp_path):
     server.shutdown()
 
 
+OFFICIAL = (
+    "83b16f62736572766174696f6e2f696d61676584c40b5f5f6e6461727261795f5fc3c40464617461c406000102030405c405"
+    "6474797065a37c7531c405736861706593010203b16f62736572766174696f6e2f737461746584c40b5f5f6e646172726179"
+    "5f5fc3c40464617461c410000000000000e03f000000000000f0bfc4056474797065a33c6638c40573686170659102a67072"
+    "6f6d7074a2676f"
+)
+"""What openpi-client 0.1.2 makes of the message below."""
+
+
+def test_messages_equal_those_of_the_official_client_byte_for_byte():
+    image, state = np.arange(6, dtype=np.uint8).reshape(1, 2, 3), np.array([0.5, -1.0])
+    message = {"observation/image": image, "observation/state": state, "prompt": "go"}
+    assert packed(message).hex() == OFFICIAL
+    assert unpacked(bytes.fromhex(OFFICIAL))["observation/image"].tolist() == image.tolist()
+
+
 def test_conventions_of_grippers_and_the_order_of_an_action():
     names = ["gripper", *LIBERO.actions.names[:6]]
     answer = {"actions": np.array([[0.9, *range(6)], [0.1, *range(6)]])}
