@@ -8,6 +8,7 @@ from typing import Any, get_args, get_type_hints
 
 import pytest
 import yaml
+from command import refusal, told
 from conftest import refused
 
 import kerv_cli.cli.app  # noqa: F401 - registers the commands
@@ -20,6 +21,8 @@ from kerv_cli.cli.common import settings_yaml
 from kerv_cli.episodes.interface import read_interface
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
+from kerv_cli.lab.database import opened
+from kerv_cli.lab.store import Study
 from kerv_cli.methods.compose import Method
 from kerv_cli.training.preparation import needs
 from kerv_cli.worlds.libero.spec import SPEC as LIBERO
@@ -217,3 +220,23 @@ def test_a_name_stays_in_its_own_kind_of_folder(name):
 def test_a_label_is_one_line(label):
     with pytest.raises(UsageError):
         check_label(label)
+
+
+def test_advice_names_a_study_by_its_file_and_another_file_does_not_replace_it(tmp_path, monkeypatch, quick_report):
+    here, there = tmp_path / "here", tmp_path / "there"
+    for folder, horizon in (here, 3), (there, 2):
+        folder.mkdir()
+        common = f"policy.target=mt10-state task=reach episodes=1 world.horizon={horizon} record=0"
+        lines = ["name: mine", "baseline: ar", f"common: {common}", "settings:", "  ar: method=ar", ""]
+        (folder / "abl.yaml").write_text("\n".join(lines))
+    monkeypatch.chdir(here)
+    words, where = ("sweep", "study=abl.yaml"), f"results={here / 'results'}"
+    assert "1 run, 0 reused, 0 failed" in told(*words)
+    monkeypatch.chdir(there)
+    advice = Study(opened(here / "results"), "mine").how_to_run()
+    assert advice == f"run `kerv sweep study={here}/abl.yaml {where}`"
+    assert f"study={there}/abl.yaml would replace study 'mine' of {here}/abl.yaml" in refusal(*words, where)
+    assert "1 run, 0 reused, 0 failed" in told(*words, where, "study.name=other")
+    assert "0 run, 1 reused, 0 failed" in told(*advice.strip("run `").split()[1:])
+    (here / "abl.yaml").unlink()  # it was moved
+    assert "0 run, 1 reused, 0 failed" in told(*words, where)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 
-from kerv_cli.base.config import compose, expand, preset_file, split, swept_keys
+from kerv_cli.base.config import PRESETS, compose, expand, preset_file, split, swept_keys
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.files import read_yaml_lines
 from kerv_cli.base.limits import check_label
@@ -416,6 +417,17 @@ def study_name(study: str) -> str:
     if path.suffix not in (".yaml", ".yml"):
         return study
     return str(read_yaml_lines(path, f"study={path}")[0].get("name", path.stem)) if path.is_file() else path.stem
+
+
+def located(words: Sequence[str]) -> list[str]:
+    """Return a command's words with the absolute paths of study and method files, to type them in any folder."""
+    found = []
+    for word in words:
+        key, _, name = word.partition("=")
+        path = Path(name).expanduser().absolute()
+        is_file = key in PRESETS and path.suffix in (".yaml", ".yml") and re.fullmatch(r"[\w./ @-]+", str(path))
+        found.append(f"{key}={path}" if is_file else word)
+    return found
 
 
 def _outranked(overrides: Iterable[str], by: Sequence[str]) -> list[str]:

@@ -194,16 +194,29 @@ class Study:
         Args:
             overrides: Further overrides to append. They replace stored overrides of the same keys.
         """
-        typed: Sequence[str] = ("sweep", f"study={self.name}")
-        for row in run_rows(self.database, SWEEP, self.name):
-            if row.command[:1] == ("sweep",):
-                typed = row.command
-                break
+        typed = self._swept() or ("sweep", f"study={self.name}")
         replaced = {"results", "rerun"}
         for word in overrides:
             replaced.add(word.partition("=")[0])
         kept = [word for word in typed if word.partition("=")[0] not in replaced and not word.startswith("-")]
         return shlex.join(["kerv", *kept, *overrides, *self.database.words])
+
+    def _swept(self) -> tuple[str, ...]:
+        rows = run_rows(self.database, SWEEP, self.name)
+        return next((row.command for row in rows if row.command[:1] == ("sweep",)), ())
+
+    def check_source(self, command: Sequence[str]) -> None:
+        """Refuse a sweep whose file has the name of a study that another file describes. A file may have moved."""
+        ours, theirs = (
+            next((word.partition("=")[2] for word in words if word.startswith("study=")), "")
+            for words in (command, self._swept())
+        )
+        is_there = Path(theirs).is_file() if "/" in theirs else theirs in groups()["study"]
+        if is_there and theirs != ours:
+            raise UsageError(
+                f"study={ours} would replace study '{self.name}' of {theirs} in {self.database.shown}: "
+                "choose another study.name=NAME"
+            )
 
     def load(self) -> Study:
         """Return the study as it was planned last.

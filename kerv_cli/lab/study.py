@@ -19,7 +19,7 @@ from kerv_cli.base.paths import check_writable
 from kerv_cli.base.runtime import set_up
 from kerv_cli.episodes.identity import Setting
 from kerv_cli.episodes.policy import check
-from kerv_cli.episodes.resolve import ResolvedStudy
+from kerv_cli.episodes.resolve import ResolvedStudy, located
 from kerv_cli.episodes.runner import close_worlds
 from kerv_cli.lab.database import EPISODES, PLANNED, SETTINGS, STUDIES, WANTED, Database
 from kerv_cli.lab.plan import ALL, Episode, all_episodes
@@ -64,7 +64,7 @@ def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], ki
         CheckpointError: A setting's weights or data cannot be read.
         StorageError: The results folder is not writable.
     """
-    runtime, rerun = resolved.first.runtime, resolved.sweep.rerun
+    runtime, rerun, command = resolved.first.runtime, resolved.sweep.rerun, located(command)
     if kind == SWEEP and runtime.detach and runtime.executor != SLURM:
         raise UsageError("runtime.detach=true is for clusters: add runtime.executor=slurm")
     check_writable(str(database.results))
@@ -83,6 +83,7 @@ def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], ki
     own = {name: getattr(about, name) for name in ABOUT}
     study = Study(database, about.name, kind, tuple(settings), episodes, **own)
     if kind == SWEEP:
+        study.check_source(command)
         begun = interrupted(database, kind, command, study.name) if rerun == ALL else None
     else:
         begun = interrupted(database, kind, command)

@@ -9,7 +9,6 @@ import base64
 import functools
 import math
 import os
-import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -234,7 +233,7 @@ def study_parts(report: Report) -> dict[str, Any]:
     data = report.data
     study, rows = data.study, data.results
     suite = suite_table(rows)
-    first, results, answer = rows[0].provenance, str(study.database.results), report.verdict.sentence
+    first, answer = rows[0].provenance, report.verdict.sentence
     if not answer.startswith(tuple(row.label for row in rows)):  # a label stays as it is
         answer = answer[:1].upper() + answer[1:]
     return {
@@ -250,7 +249,7 @@ def study_parts(report: Report) -> dict[str, Any]:
         "caution": caution(rows),
         "missing": len(data.absent),
         "absent": list(dict.fromkeys(f"{one.setting.label} on {one.task}" for one in data.absent)),
-        "results": "" if results == "results" else f" results={shlex.quote(results)}",
+        "again": study.sweep_command(),
         "main": MAIN,
         "columns": note_of(rows, list(suite[0])[:MAIN]),
         "meanings": {name: text.format(study.baseline) for name, text in MEANINGS.items()},
