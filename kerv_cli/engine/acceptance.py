@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 
 class Accepted(NamedTuple):
-    """The draft nodes that an acceptance rule accepts, and the node that it rejects.
+    """What an acceptance rule accepts of a draft, and the node that it rejects.
 
     Attributes:
         path: Indices of the accepted nodes, from depth 0 down. Empty if none was accepted.
-        rejected: Index of the rejected node after the path. If several nodes follow the path, this is the node whose
-            token is nearest to the target's token. None if no node was rejected, because the path ends at a leaf.
+        rejected: Index of the rejected node after the path. Of several, the one nearest to the target's.
+            None if the path ends at a leaf.
     """
 
     path: tuple[int, ...]
@@ -43,14 +43,9 @@ def accept_by_group(
 ) -> Accepted:
     """Return the longest accepted path, if tokens are accepted by kinematic group (HeiSD's `sequence` rule).
 
-    A group is, for instance, position or rotation. The tokens of one group in one control step are accepted together or
-    not at all. A group is accepted if each token's distance is within the limit of the token's DoF, and if the
-    distances sum to at most `group_limit`. The distance of a token is the absolute difference, in bins, from the
-    target's prediction at this position. A path ends before a group that is rejected or that is only partly in the
-    tree.
-
-    If `start` is inside a group, the group's first tokens are committed already. Their distance counts as 0. Only the
-    group's other tokens are judged.
+    The tokens of one group (such as position or rotation) in one control step are accepted together or not at all. Each
+    token's distance must be within the limit of its DoF, and the distances must sum to at most `group_limit`. A path
+    ends before a group that is only partly in the tree. If `start` is inside a group, only its other tokens are judged.
 
     Args:
         limits: Largest accepted distance per DoF, in bins.
@@ -76,30 +71,23 @@ def accept_by_group(
 
 
 def nearest_child(tree: TokenTree, node: int, target_tokens: Sequence[int]) -> int | None:
-    """Return the child of `node` whose token is nearest to the target's prediction after `node`.
-
-    Returns None if `node` has no children.
-    """
+    """Return the child of `node` whose token is nearest to the target's prediction. None if there are no children."""
     children = [i for i, parent in enumerate(tree.parents) if parent == node]
     return min(children, key=lambda i: abs(tree.tokens[i] - target_tokens[node + 1]), default=None)
 
 
 @dataclass(frozen=True)
 class DistanceRule(Buildable):
-    """Base class of acceptance rules: accepts a draft token if it is close enough to the target's token.
-
-    Each DoF has its own limit.
-    """
+    """Base class of acceptance rules: accepts a draft token if it is close enough to the target's token."""
 
     space: ActionSpace
 
     @classmethod
     def build(cls, settings: Any, context: Any) -> Any:
-        """Return the rule for the target's action space. A subclass with settings overrides this."""
         return cls(context.target.actions)
 
     def of_drafts_from(self, proposer: str) -> DistanceRule:
-        """Return the acceptance rule for drafts of the proposer with this name. The base class returns itself."""
+        """Return the rule for drafts of the proposer with this name. The base class returns itself."""
         return self
 
     def same_limits(self, r: int, strict: bool = True) -> tuple[int, ...]:
@@ -110,7 +98,7 @@ class DistanceRule(Buildable):
     def limits(self, r: int) -> tuple[int, ...]:
         """Return the largest accepted distance of each DoF, (D,) in bins, for the acceptance radius `r` in bins.
 
-        FAST tokens encode whole chunks, so a token belongs to no DoF. For them, return a single distance.
+        FAST tokens belong to no DoF. For them, return a single distance.
         """
 
     def judge(self, tree: TokenTree, target_tokens: Sequence[int], start: int, r: int) -> Accepted:

@@ -27,11 +27,7 @@ WINDOW = 10  # number of past actions that a prediction reads (KERV's action con
 
 
 def chunk_steps(chunk: int, trained: int) -> int:
-    """Return the number of control steps to decode at once.
-
-    Args:
-        chunk: Number of control steps that the user chose. If 0, `trained` is returned.
-    """
+    """Return the number of control steps to decode at once: the user's `chunk`, or `trained` if `chunk` is 0."""
     if not 0 <= chunk <= trained:
         raise UsageError(f"chunk={chunk}: the target was trained for {trained} control steps")
     return chunk or trained
@@ -40,10 +36,7 @@ def chunk_steps(chunk: int, trained: int) -> int:
 class Follower:
     """Follows one episode at a time. The caller reports the start, every executed action and the end.
 
-    A decoder is a follower that decodes. A batch has a follower for each of its episodes.
-
     Attributes:
-        space: The action space.
         cameras: Names of the cameras whose images the decoder reads.
         task: Name of the running episode's task.
         path: Measured positions of the end effector, (3,) each, metres, oldest first.
@@ -60,17 +53,14 @@ class Follower:
         self._executed = np.zeros((0, self.space.dofs))
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
-        """Start a new episode.
+        """Start a new episode. Parts that draw random numbers use `seed`.
 
         Args:
-            task: Name of the task.
-            seed: Seed of the episode, for parts that draw random numbers.
             end_effector: Initial position (3,), metres.
         """
         self._start(task, [np.asarray(end_effector)])
 
     def decode(self, observation: Observation) -> DecodeRecord:
-        """Return a record with the actions to execute. The observation must have the images of `cameras`."""
         raise NotImplementedError
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
@@ -83,26 +73,23 @@ class Follower:
         """Return the last executed actions (m, D), oldest first, normalised and not rounded to tokens; m ≤ WINDOW.
 
         Args:
-            pending: Actions (k, D) of the current chunk that are decided but not executed yet. They count as executed,
-                so that a prediction continues after them. None if there are none.
+            pending: Actions (k, D) of the current chunk that are decided but not executed yet. They count as executed.
         """
         if pending is None or not len(pending):
             return self._executed
         return np.concatenate([self._executed, pending])[-WINDOW:]
 
     def finish(self, success: bool) -> None:
-        """End the episode. `success` says whether the task was solved."""
+        pass
 
 
 @dataclass(eq=False)
 class TargetSide:
     """What the target holds for one chunk: the prompt, the cache, and hidden states.
 
-    The cache holds the prompt and the committed tokens, except those that the target has not read yet (`uncached`).
-
     Attributes:
         encode: Function that encodes the observation and returns the prompt's embeddings (1, P, E).
-        cache: Keys and values of the prompt and of committed tokens.
+        cache: Keys and values of the prompt and of the committed tokens that the target has read.
         hidden: Hidden states after the prefill, (1, P + c − 1, E). c is the number of tokens that the prefill
             committed. None before the prefill.
     """
@@ -113,15 +100,11 @@ class TargetSide:
 
     @cached_property
     def prompt(self) -> Tensor:
-        """The prompt's embeddings (1, P, E).
-
-        They are computed when this property is first read. So skipped chunks need not pay for encoding.
-        """
+        """The prompt's embeddings (1, P, E), computed when first read. So skipped chunks need not pay for encoding."""
         return self.encode()
 
     @property
     def prompt_length(self) -> int:
-        """Number of prompt tokens P. Reading it encodes the prompt, if that has not been done yet."""
         return self.prompt.shape[1]
 
     def uncached(self, tokens: Sequence[int]) -> list[int]:
@@ -134,28 +117,21 @@ class TargetSide:
 
 @dataclass(eq=False)
 class Chunk:
-    """State of one decode: the tokens committed so far, and the rounds that committed them.
-
-    The parts of a method read it and return their results. The decoder stores these results in it.
+    """State of one decode. The parts of a method read it and return their results, which the decoder stores in it.
 
     Attributes:
         steps: H, number of control steps.
-        space: The action space.
-        episode: The running episode so far, such as the last executed actions.
-        target: What the target holds for this chunk, such as its cache.
         limits: Largest accepted distance of each DoF, in bins. Early drafters choose the tokens that are most likely to
             be accepted within these distances.
         choice: What the method's boundary decided about this chunk. None if the method has no boundary.
         tokens: The committed tokens.
-        rounds: Records of the rounds so far.
         judged: The draft that the last round verified. Empty if it verified none.
         forwards: Number of forwards of the target so far.
         similarity: Cosine of the most similar entry of a datastore. None if no part searched.
-        reason: The skip rule's reason to skip or to verify. None if there is no reason.
-        closed: If a rectifier ended the chunk early: the normalised actions (S, D) of its S ≤ H control steps.
-            Otherwise None.
-        filled: If decoding went on after a rectifier's prediction: the predicted normalised values, by the index of the
-            token that each value replaces.
+        reason: The skip rule's reason to skip or to verify.
+        closed: The normalised actions (S, D) of S ≤ H control steps, if a rectifier ended the chunk early.
+        filled: The normalised values that a rectifier predicted, if decoding went on after it. The keys are the indices
+            of the tokens that they replace.
     """
 
     steps: int
@@ -190,7 +166,6 @@ class Chunk:
 
     @property
     def remaining(self) -> int:
-        """Largest number of tokens that can still be decoded. 0 if the chunk has ended."""
         return 0 if self.ended else self.size - len(self.tokens)
 
     @property
@@ -198,10 +173,9 @@ class Chunk:
         return len(self.filled) if self.closed is None else max(0, self.closed.size - len(self.tokens))
 
     def distance(self, tokens: Sequence[int], others: Sequence[int]) -> float:
-        """Return the mean absolute difference of two token sequences, in normalised action units.
+        """Return the mean absolute difference of two token sequences from the chunk's start, normalised units.
 
-        Both sequences begin at the chunk's first token and have the same length. The distance is infinite if they
-        differ in a strict DoF (a DoF that must equal the target's token, such as a gripper).
+        It is infinite if they differ in a strict DoF, such as a gripper.
         """
         first, second = np.array(tokens), np.array(others)
         if (first != second)[self.space.strict_tokens(len(first))].any():
@@ -211,9 +185,7 @@ class Chunk:
     def targets_along(self, chain: Sequence[int]) -> list[int] | None:
         """Return the target's predictions along a chain of the draft that the prefill verified. Call it in that round.
 
-        Returns:
-            The target's token at each verified position, N − 1 or N tokens. None if the prefill verified fewer than
-            N − 1 tokens of this chain.
+        Returns N − 1 or N tokens. None if the prefill verified fewer than N − 1 tokens of this chain.
         """
         tree, target_tokens, _ = self.judged
         nodes = {pair: node for node, pair in enumerate(zip(tree.parents, tree.tokens, strict=True))}
@@ -226,7 +198,6 @@ class Chunk:
         return targets if len(targets) >= self.size - 1 else None
 
     def commit(self, record: Round, tokens: Sequence[int], judged: Judged | None = None) -> None:
-        """Commit the tokens that one forward of the target decided. `judged` is the draft, if it verified one."""
         self.forwards += 1
         self.tokens += tokens
         self.rounds.append(record)
@@ -252,15 +223,13 @@ class Chunk:
         self.rounds.append(Round("skip", proposer, drafted=drafted, accepted=size, committed=size))
 
     def until_end(self, tokens: Sequence[int]) -> list[int]:
-        """Return the tokens up to and including the first end token."""
         found, end = list(tokens), self.space.end
         return found[: found.index(end) + 1] if end is not None and end in found else found
 
     def rectify(self, found: Rectified, with_target_token: bool) -> None:
-        """Commit the values that a rectifier predicted.
+        """Commit the values that a rectifier predicted. The robot executes them without rounding.
 
-        The robot executes these values without rounding. If decoding continues, the target reads the tokens that are
-        nearest to these values.
+        If decoding continues, the target reads the tokens that are nearest to these values.
         """
         if not with_target_token:
             del self.tokens[-1]
@@ -274,17 +243,11 @@ class Chunk:
         self.tokens += self.space.bins_of(values).flatten()[start:].tolist()
 
     def actions(self) -> np.ndarray:
-        """Return the actions (S, D) of the complete chunk, float32, environment units.
-
-        S is `steps`, or fewer if a rectifier ended the chunk early.
-        """
+        """Return the chunk's actions (S, D), float32, environment units. S < `steps` if a rectifier ended it early."""
         return self.space.unnormalise(self.values(self.steps)).astype(np.float32)
 
     def values(self, steps: int) -> np.ndarray:
-        """Return the normalised actions (S, D) of the complete chunk.
-
-        S is `steps` for FAST tokens, otherwise the number of decoded control steps.
-        """
+        """Return the normalised actions (S, D). S is `steps` for FAST tokens, else the number of decoded steps."""
         if self.closed is not None:
             return self.closed
         values = self.space.chunk_values(self.tokens, steps)
@@ -292,7 +255,6 @@ class Chunk:
         return values
 
     def record(self, actions: np.ndarray, seconds: float, phases: dict[str, float]) -> DecodeRecord:
-        """Return the record of the complete chunk. The arguments become the record's attributes of the same names."""
         return DecodeRecord(
             tokens=tuple(self.tokens),
             actions=actions,
@@ -313,11 +275,6 @@ class Chunk:
 
 
 def check_tokens(tokens: np.ndarray, vocabulary: int, proposer: str) -> None:
-    """Raise an error if a drafted token is out of range.
-
-    Args:
-        tokens: (n,) integers.
-    """
     if tokens.size and not (tokens.min() >= 0 and tokens.max() < vocabulary):
         wrong = next(token for token in tokens.tolist() if not 0 <= token < vocabulary)
         raise KervError(f"the proposer '{proposer}' drafted token {wrong}: tokens are 0 to {vocabulary - 1}")

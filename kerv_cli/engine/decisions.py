@@ -1,8 +1,6 @@
 """Drafts as trees, and what the parts of a method return to the decoder. Imports neither torch nor numpy.
 
-Node i of a tree has a token, a parent and a depth. Parent −1 is the last committed token. Depth 0 is the first drafted
-position. Parents come before their children. After c committed tokens, a node at depth d is token c + d of the chunk
-(docs/methods.md §2).
+After c committed tokens, a node at depth d is token c + d of the chunk (docs/methods.md §2).
 """
 
 from __future__ import annotations
@@ -119,8 +117,7 @@ class Rectified(NamedTuple):
     Attributes:
         values: Normalised actions (S, D) of the chunk's first S control steps: first the values of the committed
             tokens, then predicted values.
-        ends: Whether the chunk ends with these actions, so that later control steps are dropped. If False, the target
-            decodes the later steps.
+        ends: Whether the chunk ends with these actions. If False, the target decodes the later steps.
     """
 
     values: np.ndarray
@@ -133,7 +130,7 @@ class SkipDecision(NamedTuple):
     Attributes:
         tokens: The N tokens of the chunk, to execute without verification. None if the target decodes the chunk.
         proposer: Name of the proposer that drafted `tokens`. PARALLEL (`record.py`) if a parallel target computed them.
-        reason: The rule's reason to skip or to verify, which `DecodeRecord.reason` stores. None if there is no reason.
+        reason: The rule's reason to skip or to verify, which `DecodeRecord.reason` stores.
     """
 
     tokens: Sequence[int] | None = None

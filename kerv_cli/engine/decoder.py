@@ -31,8 +31,7 @@ from kerv_cli.engine.record import PHASES, UNTIMED, DecodeRecord, Round, variabi
 class Stopwatch:
     """Measures the seconds that each phase of one decode takes (`PHASES`).
 
-    On CUDA the stopwatch records events in the stream and reads them at the end. So measuring does not slow the decode.
-    The CPU waits for the GPU only at the start and at the end.
+    On CUDA it records events in the stream. The CPU waits for the GPU only at the start and at the end.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -44,7 +43,6 @@ class Stopwatch:
         self.began = self.last = time.perf_counter()
 
     def lap(self, phase: str) -> None:
-        """Add the time since the last lap to `phase`, one of `PHASES`. On CUDA, this time is added by `stop`."""
         if self.events is not None:
             self.events.append((phase, self._event()))
             return
@@ -53,7 +51,6 @@ class Stopwatch:
         self.last = now
 
     def stop(self) -> float:
-        """Stop and return the seconds since the start. The time since the last lap counts as phase `other`."""
         self.lap("other")
         if self.events is not None:
             torch.cuda.synchronize()
@@ -146,11 +143,6 @@ class Decoder(Follower):
 
     @torch.inference_mode()
     def decode(self, observation: Observation) -> DecodeRecord:
-        """Decode one observation, and return a record that holds the actions to execute.
-
-        The record's `seconds` are measured from the observation to the actions, with the device synchronised at both
-        ends.
-        """
         stopwatch = Stopwatch(self.target.device)
 
         def encode() -> Tensor:
@@ -175,15 +167,10 @@ class Decoder(Follower):
 
     @torch.inference_mode()
     def decode_prompt(self, prompt: Tensor | Callable[[], Tensor], stopwatch: Stopwatch | None = None) -> Chunk:
-        """Decode the chunk for one prompt.
+        """Return the complete chunk for one prompt.
 
         Args:
             prompt: The prompt's embeddings (1, P, E), or a function that computes them when they are first needed.
-            stopwatch: Measures the phases. If None, a new stopwatch is made.
-
-        Returns:
-            The finished chunk. It has N committed tokens, or fewer if an end token or a rectifier's prediction ended
-            the chunk early.
         """
         stopwatch = stopwatch or Stopwatch(self.target.device)
         chunk, skip = self._new_chunk(prompt), self.parts.skip
@@ -233,10 +220,7 @@ class Decoder(Follower):
         stopwatch.lap("propose")
 
     def decode_plainly(self, chunk: Chunk, stopwatch: Stopwatch) -> None:
-        """Decode the remaining tokens without drafts.
-
-        The target decodes them in one call if it can (`ContinuesGreedily`), else with one forward per token.
-        """
+        """Decode the remaining tokens without drafts, in one call of the target if it can (`ContinuesGreedily`)."""
         tokens = None
         if isinstance(self.target, ContinuesGreedily):
             tokens = self.target.continue_greedily(
@@ -249,10 +233,9 @@ class Decoder(Follower):
         stopwatch.lap("accept")
 
     def forward_singly(self, chunk: Chunk, stopwatch: Stopwatch) -> list[int]:
-        """Decode the remaining tokens with one forward each, and return them.
+        """Decode the remaining tokens with one forward each. The CPU reads them after the last forward.
 
-        Each token stays on the device as the input of the next forward. The CPU reads all tokens after the last
-        forward. But if an end token can end the chunk, the CPU reads each token right after its forward.
+        If an end token can end the chunk, the CPU reads each token right after its forward.
         """
         target, cache = self.target, chunk.target.cache
         first = cache.length
@@ -267,21 +250,16 @@ class Decoder(Follower):
         return torch.cat(tokens[1:]).tolist()
 
     def propose(self, chunk: Chunk, proposer: Proposer | None, stopwatch: Stopwatch) -> Draft:
-        """Return a draft of at most `remaining − 1` tokens per path: the target itself gives the chunk's last token."""
         if proposer is None or chunk.remaining < 2:
             return EMPTY
-        depth = chunk.remaining - 1
+        depth = chunk.remaining - 1  # the target itself gives the chunk's last token
         draft = proposer.propose(chunk, depth)
         draft.check(self.space.tokens, proposer.name, depth)
         stopwatch.lap("propose")
         return draft
 
     def verify(self, chunk: Chunk, draft: Draft) -> Verified:
-        """Run the target once, over the tokens that are not in its cache yet, followed by the draft.
-
-        In the first round, the uncached tokens are the prompt. In later rounds, the only one is the last committed
-        token, unless a rectifier has filled several tokens.
-        """
+        """Run the target once, over the tokens that are not in its cache yet (first the prompt) and the draft."""
         target, cache, uncached = self.target, chunk.target.cache, chunk.target.uncached(chunk.tokens)
         before = len(uncached) or chunk.target.prompt_length
         positions, seen = draft.positions(cache.length, before, target.device), draft.visible(before)
@@ -300,7 +278,6 @@ class Decoder(Follower):
         return Verified(hidden, tree, targets.astype(np.int64).tolist(), draft.levels or tree.levels)
 
     def accept(self, chunk: Chunk, verified: Verified, proposer: Proposer | None) -> Accepted:
-        """Return the path that the acceptance rule chooses. The path is empty if there was no proposer."""
         if proposer is None:
             return Accepted((), None)
         rule, r = self.acceptance.of_drafts_from(proposer.name), self.threshold.radius()
@@ -312,9 +289,7 @@ class Decoder(Follower):
     def commit(self, chunk: Chunk, verified: Verified, accepted: Accepted, proposer: Proposer | None) -> Tensor:
         """Commit the accepted path and, if the chunk has room, the bonus: the target's next token.
 
-        Returns:
-            The target's hidden states (1, b + a, E) from this forward. The first b belong to the tokens before the
-            draft, the other a to the accepted draft tokens.
+        Returns the target's hidden states (1, b + a, E): b of tokens before the draft, a of accepted draft tokens.
         """
         tree, target_tokens, (path, rejected) = verified.tree, verified.target_tokens, accepted
         if proposer is None or not len(tree):
@@ -341,7 +316,7 @@ class Decoder(Follower):
         return self._keep(chunk, verified, list(path))
 
     def _keep(self, chunk: Chunk, verified: Verified, rows: list[int]) -> Tensor:
-        """Remove rejected draft tokens from the cache. Return the hidden states of all other tokens of the forward."""
+        # removes the rejected draft tokens from the cache
         cache, hidden = chunk.target.cache, verified.hidden
         end, before = cache.length - len(verified.tree), hidden.shape[1] - len(verified.tree)
         if rows == list(range(len(rows))):  # the first nodes of a chain are already in their slots
@@ -390,7 +365,6 @@ class BatchDecoder:
 
     @torch.inference_mode()
     def decode(self, episodes: Sequence[Follower], observations: Sequence[Observation]) -> list[DecodeRecord]:
-        """Decode one observation per episode. Return one record per episode, with the actions to execute."""
         prompts = functools.cache(lambda: self._encode(observations))  # encoded only if some part reads a prompt
         steps, space, cache = self.decoder.steps, self.target.actions, self.decoder.cache
         chunks = []
@@ -416,14 +390,13 @@ class BatchDecoder:
         return [chunk.record(chunk.actions(), math.nan, dict(UNTIMED)) for chunk in chunks]
 
     def _encode(self, observations: Sequence[Observation]) -> list[Tensor]:
-        """Encode one by one on a CPU, because kerv's compiled encoders are faster that way. Each is (1, P, E)."""
+        # on a CPU one by one, because kerv's compiled encoders are faster that way; each is (1, P, E)
         if isinstance(self.target, EncodesMany) and self.target.device.type != "cpu":
             return list(self.target.encode_many(observations).split(1))
         return list(map(self.target.encode, observations))
 
     def _cache(self, rows: int) -> Cache:
-        """Return an empty cache for `rows` sequences. Only the last one is kept: their number often changes."""
-        if rows not in self._caches:
+        if rows not in self._caches:  # only the last one is kept: the number of rows often changes
             self._caches = {rows: self.target.new_cache(rows, self.target.max_prompt + self.size)}
         self._caches[rows].length = 0
         return self._caches[rows]
@@ -439,8 +412,8 @@ def greedy(target: Target, prompt: Tensor, cache: Cache | None = None, size: int
         size: N, number of tokens to decode. If 0, the largest number that a chunk of the target can have.
 
     Returns:
-        Two tensors. The decoded tokens (B, N), which after an end token are all end tokens. The hidden states
-        (B, P + N − 1, E) of the prompt and of all decoded tokens but the last.
+        The decoded tokens (B, N), which after an end token are all end tokens. The hidden states (B, P + N − 1, E) of
+        the prompt and of all decoded tokens but the last.
     """
     length, size = prompt.shape[1], size or target.actions.longest(target.chunk)
     cache = cache or target.new_cache(len(prompt), length + size)

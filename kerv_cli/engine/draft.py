@@ -21,15 +21,13 @@ HOST = torch.device("cpu")
 
 @dataclass(frozen=True)
 class Draft:
-    """n draft tokens to verify.
-
-    Tokens on the GPU are copied to the CPU together with the target's tokens, so that the CPU waits only once.
+    """n draft tokens to verify. Those on a GPU are copied together with the target's tokens: the CPU waits once.
 
     Attributes:
         tokens: (n,) int64.
         parents: Index of each token's parent, (n,) int64; −1 is the last committed token. None for a chain.
         levels: Maximum depth of the tree. Needed only when `parents` is on the GPU.
-        paths: The mask `ancestors`, if the proposer has computed it already. If None, `ancestors` computes the mask.
+        paths: The mask `ancestors`, if the proposer has computed it already.
     """
 
     tokens: Tensor
@@ -75,7 +73,6 @@ class Draft:
         return [x for x in (self.tokens, self.parents) if x is not None and x.device != HOST]
 
     def judged(self, remote: Sequence[np.ndarray]) -> TokenTree:
-        """Return the draft as a tree on the CPU, for an acceptance rule."""
         return TokenTree.build(*(vector.astype(np.int64).tolist() for vector in remote)) if remote else self.tree
 
     def tokens_after(self, committed: list[int], device: torch.device) -> Tensor:
@@ -86,9 +83,9 @@ class Draft:
 
     @cached_property
     def ancestors(self) -> np.ndarray | Tensor | None:
-        """Mask (n, n) bool: entry [i, j] says whether token j is token i or one of its ancestors.
+        """Mask (n, n) bool, on the device of `parents`. None for a chain.
 
-        The mask is on the device of `parents`. None if the draft is a chain.
+        Entry [i, j] says whether token j is token i or one of its ancestors.
         """
         if self.parents is None:
             return None
@@ -110,10 +107,7 @@ class Draft:
         return torch.cat([torch.arange(start, stop, device=device), stop + depths])
 
     def visible(self, before: int) -> np.ndarray | Tensor | None:
-        """Return the attention mask of a verification, (before + n, before + n) bool. None if attention is causal.
-
-        Entry [i, j] says whether token i of the forward attends to token j.
-        """
+        """Return the attention mask of a verification, (before + n, before + n) bool. None if attention is causal."""
         seen, size = self.ancestors, before + len(self)
         if seen is None:
             return None
@@ -131,8 +125,8 @@ def _vector(numbers: Sequence[int]) -> Tensor:
 EMPTY = Draft.of(())
 
 
+# both return `Draft.ancestors`, (n, n) bool
 def ancestors_of(parents: Sequence[int]) -> np.ndarray:
-    """Compute `Draft.ancestors`, (n, n) bool, from n parents on the CPU."""
     paths: list[int] = []  # bit j of number i: node j is node i or its ancestor
     for i, parent in enumerate(parents):
         paths.append(1 << i | (paths[parent] if parent != ROOT else 0))
@@ -142,11 +136,6 @@ def ancestors_of(parents: Sequence[int]) -> np.ndarray:
 
 
 def ancestors_on_device(parents: Tensor, levels: int) -> Tensor:
-    """Compute `Draft.ancestors`, (n, n) bool, on the GPU.
-
-    Args:
-        parents: Index of each token's parent, (n,), on the GPU.
-    """
     n, nodes = parents.shape[0], torch.arange(parents.shape[0], device=parents.device)
     reached = ((parents[:, None] == nodes) | (nodes[:, None] == nodes)).float()
     for _ in range((levels - 1).bit_length() if n else 0):  # doubles the path length: 1, 2, 4, … steps
@@ -155,24 +144,17 @@ def ancestors_on_device(parents: Tensor, levels: int) -> Tensor:
 
 
 def upload(numbers: ArrayLike, device: torch.device) -> Tensor:
-    """Return integers as a tensor on the device, without waiting for the copy.
-
-    On CUDA the copy is made from pinned memory, which PyTorch's allocator keeps until the copy is done.
-    """
+    """Return integers as a tensor on the device, without waiting for the copy."""
     host = torch.from_numpy(np.asarray(numbers))  # five times as fast as torch.as_tensor for a list
     if device.type == "cpu":
         return host
     if device.type == "cuda":
-        host = host.pin_memory()
+        host = host.pin_memory()  # PyTorch's allocator keeps it until the copy is done
     return host.to(device, non_blocking=True)
 
 
 def read(*parts: Tensor) -> list[np.ndarray]:
-    """Copy several vectors from one device to the CPU in a single transfer, and wait for it.
-
-    Returns:
-        One array per vector.
-    """
+    """Copy several vectors from one device to the CPU in a single transfer, and wait for it."""
     sizes, together = list(map(len, parts)), parts[0]
     if len(parts) > 1:
         mixed = len({part.dtype for part in parts}) > 1

@@ -29,12 +29,7 @@ class Buildable(ABC):  # noqa: B024 - its subclasses are the interfaces
 
     @classmethod
     def build(cls, settings: Any, context: Any) -> Any:
-        """Return the part that these settings choose. None if the method works without the part.
-
-        Args:
-            settings: Settings of the part.
-            context: The `Context` (`kerv_cli/methods/context.py`): target, artifacts, task, parts built so far.
-        """
+        """Return the part that these settings choose. None if the method works without the part."""
         return cls(settings, context)
 
 
@@ -73,11 +68,9 @@ class Fixed(Threshold):
 
     @classmethod
     def build(cls, settings: Any, context: Any) -> Fixed:
-        """Build the threshold with the radius `settings.r`."""
         return cls(settings.r)
 
     def radius(self) -> int:
-        """Return the constant radius r, in bins."""
         return self.r
 
 
@@ -95,18 +88,13 @@ class Rectifier(Buildable):
         """Start a new episode."""
 
     def next_decode(self) -> None:
-        """Tell the rectifier that a decode has ended. Called after every decode.
-
-        A rectifier that pauses for some decodes after a prediction counts these decodes here.
-        """
+        """Count a decode that has ended. Called after every decode, for rectifiers that pause after a prediction."""
 
     @abstractmethod
     def rectify(self, chunk: Chunk) -> Rectified | None:
         """Predict the missing values of the control step in which a draft token was rejected.
 
-        Returns:
-            The predicted values. None if the rectifier predicts nothing. The target then goes on decoding after its own
-            token at the rejected position.
+        Return None to predict nothing. The target then goes on decoding after its own token at the rejected position.
         """
 
 
@@ -114,7 +102,7 @@ class Boundary(Buildable):
     """Decides whether retrieval or the drafter drafts the next chunk (docs/methods.md §4.4)."""
 
     def reset(self, task: str, seed: int) -> None:
-        """Start a new episode of `task` with this seed."""
+        """Start a new episode."""
 
     @abstractmethod
     def choose(self, path: np.ndarray) -> Choice:
@@ -131,7 +119,7 @@ class Skip(Buildable):
     phase = "propose"  # entry of `PHASES` that the time of `take` counts for
 
     def begin(self, task: str, seed: int) -> None:
-        """Start a new episode of `task` with this seed."""
+        """Start a new episode."""
 
     def finish(self, success: bool) -> None:
         """End the episode. `success` says whether the task was solved."""
@@ -141,7 +129,4 @@ class Skip(Buildable):
         """Decide whether a chunk is executed without verification. Called before the target runs."""
 
     def verified(self, chunk: Chunk) -> None:
-        """Learn how the target judged the prefill draft.
-
-        Called after the prefill of each chunk that `take` did not complete.
-        """
+        """Learn how the target judged the prefill draft. Called after each prefill, so never after a skip."""

@@ -20,8 +20,8 @@ class Proposer(Buildable):
 
     Attributes:
         name: Name in the records, e.g. `drafter`.
-        nodes: Number of draft tokens for which the cache must reserve room. The cache always has room for N, the
-            number of tokens in a chunk. So proposers that never draft more than N tokens keep the default 0.
+        nodes: Number of draft tokens for which the cache must reserve room, if they can be more than the N tokens of a
+            chunk.
     """
 
     name = ""
@@ -44,7 +44,6 @@ class Proposer(Buildable):
             chunk: The chunk, which already holds the round's committed tokens.
             first: Index in the chunk of the token just before this round's tokens. `hidden` starts with this token.
             hidden: The target's hidden states (1, T, E) of T tokens of the chunk, with indices first … first + T − 1.
-                E is the target's width.
             target_tokens: 1 + n tokens: the target's prediction after token `first`, then after each of the draft's n
                 nodes. Rejected nodes are included.
         """
@@ -53,12 +52,11 @@ class Proposer(Buildable):
 class ChainProposer(Proposer):
     """Base class of proposers that draft plain sequences (chains) on the CPU.
 
-    Chains that are drafted before the prefill can be merged with chains of other proposers, or executed without
+    Chains that are drafted before the prefill can be merged with other proposers' chains, or executed without
     verification.
     """
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
-        """Return the best chain as a draft. The draft is empty if there is no chain."""
         from kerv_cli.engine.draft import EMPTY, Draft
 
         chains = self.chains(chunk, depth)

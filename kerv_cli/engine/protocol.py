@@ -14,17 +14,15 @@ from torch import Tensor, nn
 
 from kerv_cli.base.spaces import ActionSpace, Observation
 
+# attention mask (T, M) bool, or None if attention is causal; entry [i, j] says whether new token i attends to token j
+# of the last M tokens, which are M − T cached ones and the T new ones; a target on a GPU may get a tensor
 Seen = np.ndarray | Tensor | None
-"""Attention mask (T, M) bool, or None if attention is causal. Entry [i, j] says whether new token i attends to token j
-of the last M tokens. These are M − T cached tokens and then the T new tokens. A target on a GPU may get a tensor
-instead of an array."""
 
 
 class Cache(Protocol):
     """Keys and values of the tokens that the target has processed, one token per slot.
 
-    Slots 0 … length − 1 of `capacity` are filled. `Target.forward` writes its new tokens after them and increases
-    `length`.
+    Slots 0 … length − 1 of `capacity` are filled. `Target.forward` adds its tokens after them and raises `length`.
     """
 
     length: int
@@ -74,12 +72,7 @@ class Target(Protocol):
         """Return the embeddings (B, T, E) of action tokens (B, T) int64."""
 
     def new_cache(self, batch: int, capacity: int) -> Cache:
-        """Return an empty cache of keys and values.
-
-        Args:
-            batch: Number of sequences B.
-            capacity: Number of tokens that fit into each sequence.
-        """
+        """Return an empty cache for `batch` sequences of up to `capacity` tokens."""
 
     def forward(self, x: Tensor, positions: Tensor, cache: Any = None, seen: Seen = None) -> Tensor:
         """Process T new tokens that follow the cached ones, and return their hidden states (B, T, E).
@@ -114,8 +107,6 @@ class ContinuesGreedily(Protocol):
 
         Args:
             token: The last committed token. It is not in the cache yet.
-            count: Number of tokens to decode.
-            cache: Holds all tokens before `token`.
             end: Token after which to stop. If None, all `count` tokens are decoded.
 
         Returns:
@@ -128,14 +119,10 @@ class PredictsTokens(Protocol):
     """A target that predicts the next tokens in one call, faster than with `embed`, `forward` and `head`."""
 
     def predict(self, tokens: Tensor, positions: Tensor, cache: Any, seen: Seen) -> tuple[Tensor, Tensor]:
-        """Process T new tokens that follow the cached ones.
+        """Process T new tokens, as `Target.forward` does.
 
         Args:
             tokens: The new tokens (T,) int64.
-            positions: Position of each new token in the sequence (T,), for the positional encoding.
-            cache: From `new_cache`. The new tokens attend to all cached tokens and are added to the cache.
-            seen: Attention mask (T, T) bool: entry [i, j] says whether new token i attends to new token j. None if
-                attention is causal.
 
         Returns:
             The most probable token after each new token, (T,) int64, and the hidden states (1, T, E) of the new tokens.
@@ -147,23 +134,16 @@ class JoinsDrafters(Protocol):
     """A target that can be compiled together with a drafter, and that can enlarge a small policy's drafter."""
 
     def join(self, function: Callable[..., Any], *shapes: tuple[int, ...], repeats: bool = False) -> Any:
-        """Compile a function that calls modules of the target and of a compiled drafter.
+        """Compile a function of modules of the target and a compiled drafter. None if the target is not compiled.
 
         Args:
-            function: The function. Its inputs are float32 tensors of batch size 1.
-            shapes: Shape of each input.
+            function: Its inputs are float32 tensors of batch size 1 and of these `shapes`.
             repeats: Whether the program can run several times in one call. The outputs of each run are the inputs of
                 the next, to decode or draft several tokens.
-
-        Returns:
-            The compiled program. None if the target is not compiled.
         """
 
     def enlarge(self, drafter: nn.Module) -> None:
-        """Enlarge a small policy's drafter in place, so that it fits this target.
-
-        Does nothing if this target was not made by enlarging a small policy (docs/methods.md §0.2).
-        """
+        """Enlarge a small policy's drafter in place, if this target was enlarged, too (docs/methods.md §0.2)."""
 
 
 class ReadableTarget(Target, Protocol):
@@ -190,17 +170,14 @@ class ReadableTarget(Target, Protocol):
         """Floating-point type of the weights."""
 
     def pooled(self, prompt: Tensor) -> Tensor:
-        """Summarise each prompt (B, P, E) in one vector of F numbers, (B, F).
-
-        The early drafter, which drafts before the prefill, reads these vectors.
-        """
+        """Summarise each prompt (B, P, E) in one vector (B, F), which the early drafter reads before the prefill."""
 
 
 class ParallelTarget(Target, Protocol):
     """A target that decodes all N tokens of a chunk at once. It cannot decode token by token.
 
     Attributes:
-        parallel: Always True. It marks the target as parallel.
+        parallel: Always True.
     """
 
     parallel: bool

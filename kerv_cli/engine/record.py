@@ -13,14 +13,11 @@ import numpy as np
 
 from kerv_cli.base.spaces import ActionSpace
 
-PARALLEL = "parallel"
-"""Mode of a round in which a parallel target decoded all tokens at once. Also the mode of the decode."""
+PARALLEL = "parallel"  # mode of a round, and of its decode, in which a parallel target decoded all tokens at once
 
+# phases of a decode; their seconds add up to `DecodeRecord.seconds`; `vision` is the time of `Target.encode`
 PHASES = ("vision", "prefill", "propose", "verify", "accept", "rectify", "other")
-"""Phases of a decode. Their seconds add up to `DecodeRecord.seconds`. `vision` is the time of `Target.encode`."""
-
-UNTIMED = dict.fromkeys(PHASES, math.nan)
-"""Seconds by phase if several episodes were decoded at once: all NaN, because a single decode then has no time."""
+UNTIMED = dict.fromkeys(PHASES, math.nan)  # of episodes that were decoded together: a single decode has no time
 
 
 @dataclass(frozen=True)
@@ -32,16 +29,14 @@ class Round:
             target did not run) or "parallel" (one forward gave all tokens).
         proposer: Name of the proposer that drafted, or "none".
         start: Number of tokens committed before this round.
-        drafted: The accepted draft tokens. If the draft was rejected after them, one rejected token follows: the one
-            that is nearest to the target's token.
+        drafted: The accepted draft tokens, then the rejected one that is nearest to the target's token, if any.
         target_tokens: The target's tokens at the positions of `drafted`. If the whole draft was accepted and the chunk
             is not full, the bonus (the target's next token) comes after them.
         accepted: Number of accepted draft tokens.
         committed: Number of committed tokens: the accepted draft tokens and the bonus.
         tree_size: Number of draft tokens in the verified tree.
         threshold: Largest accepted distance per DoF, in bins. Empty if no acceptance rule ran.
-        levels: Number of levels that were drafted for a tree. The nodes that were kept may reach fewer levels. 0 if
-            the draft was a chain.
+        levels: Number of levels that were drafted for a tree, of which fewer may be kept. 0 for a chain.
     """
 
     mode: str
@@ -71,12 +66,11 @@ class Delay:
     """Latency of a decode in a world that does not wait, and what the robot did meanwhile (docs/methods.md §8).
 
     Attributes:
-        seconds: Latency of the decode, in seconds.
         steps: Latency in control steps, rounded up.
         observed: Control step of the episode at which the observation was taken, from 0.
         carried: Number of control steps during the decode that executed the rest of the previous chunk.
         held: Number of control steps during the decode that repeated the last action. carried + held equals `steps`,
-            and is smaller only if the episode ended during the decode.
+            unless the episode ended during the decode.
         dropped: Number of actions at the start of the new chunk that are not executed, because they are too old.
     """
 
@@ -128,7 +122,6 @@ class DecodeRecord:
 
     @property
     def delay_steps(self) -> int | None:
-        """Number of control steps that passed during the decode. None if the world waited for the decode."""
         return None if self.delay is None else self.delay.steps
 
     @property
@@ -159,22 +152,17 @@ class DecodeRecord:
         return None
 
 
-MEAN = "mean of compared"
-"""The measure by which `DecodeRecord.variability` is computed."""
+MEAN = "mean of compared"  # the measure of `DecodeRecord.variability`
+# ways to compute the kinematic variability K of a decode (docs/methods.md §3.2); `accepted`: only accepted draft tokens
+# count; `compared`: the rejected token after them counts, too
 MEASURES = MEAN, "sum of compared", "mean of accepted", "sum of accepted"
-"""The ways to compute the kinematic variability K of a decode (docs/methods.md §3.2).
-
-`accepted`: only accepted draft tokens count. `compared`: the rejected token after them counts, too.
-"""
 
 
 def variability(rounds: Sequence[Round], space: ActionSpace, measure: str = MEAN) -> float | None:
-    """Return the kinematic variability K: how far a decode's drafts were from the target's tokens.
+    """Return the kinematic variability K, in normalised action units: how far drafts were from the target's tokens.
 
     Strict DoFs, such as a gripper, are left out, because one wrong gripper token would outweigh all other differences.
-
-    Returns:
-        K in normalised action units. None if no draft token counts, or if tokens have no distance.
+    None if no draft token counts, or if tokens have no distance.
     """
     if space.code is not None:
         return None
@@ -220,7 +208,6 @@ class EpisodeRecord:
 
     @property
     def seconds(self) -> float:
-        """Sum of the inference times of all decodes, in seconds. NaN if the episode was not timed."""
         return sum(d.seconds for d in self.decodes)
 
     @property
@@ -241,7 +228,6 @@ class EpisodeRecord:
 
     @property
     def path_length(self) -> float:
-        """Length of the end effector's path, metres."""
         return path_length(self.path)
 
     @property
