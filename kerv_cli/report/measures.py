@@ -51,6 +51,7 @@ class Measures:
         latency_p50_ms: Median time of a decode, milliseconds.
         latency_p95_ms: 95th percentile of the time of a decode, milliseconds.
         latency_worst_ms: Time of the slowest decode, milliseconds.
+        answer_ms: Mean time of a decode, milliseconds.
         server_ms: Mean time of an answer as the policy's server measures it, milliseconds.
         AL: Acceptance length, tokens per verification.
         accepted_per_round: Accepted draft tokens per verification.
@@ -94,6 +95,7 @@ class Measures:
     latency_p50_ms: float
     latency_p95_ms: float
     latency_worst_ms: float
+    answer_ms: float = field(metadata={RATIO: ("seconds", "decodes")})
     server_ms: float = field(metadata={RATIO: ("server_seconds", "server_decodes")})
     AL: float = field(metadata={RATIO: ("committed", "verifications")})
     accepted_per_round: float = field(metadata={RATIO: ("accepted", "verifications")})
@@ -468,7 +470,7 @@ def _means(episodes: pd.DataFrame, by: list[str]) -> pd.DataFrame:
     sums = groups[list(dict.fromkeys(itertools.chain.from_iterable(_RATIOS.values())))].sum()
     for name, (above, below) in _RATIOS.items():
         means[name] = sums[above] / sums[below].mask(sums[below] == 0)
-    means[["felt_latency_ms", "server_ms"]] *= 1000.0
+    means[["felt_latency_ms", "answer_ms", "server_ms"]] *= 1000.0
     means["server_ms"] = means["server_ms"].where(means["server_ms"] > 0)  # 0: the servers do not say
     for name, part in ColumnPart.every().items():  # of plugins
         means[name] = [float(part.built(group)) for _, group in groups]

@@ -44,7 +44,7 @@ _HEADING = 12
 """Width at which a heading is wrapped, in characters."""
 _LABEL = 16
 """Width at which a label is wrapped, in characters."""
-ANSWER, OF_SERVER = "median answer, ms", "of it the server's, ms"
+ANSWER, OF_SERVER = "an answer takes, ms", "of it the server's, ms"
 MEANINGS = {
     "success": "share of episodes that solved their task",
     DIFFERENCE: "points more or less than {0}, over pairs: episodes of both from the same initial state",
@@ -54,7 +54,7 @@ MEANINGS = {
     SPEEDS["speedup"]: "the same for the time of a control step. * means: some pairs were not measured in turn; the "
     "speed is of the others",
     LATENCY: "95 % of the decodes take less time than this",
-    ANSWER: "median time from an observation to the server's actions, as the client sees it",
+    ANSWER: "mean time from an observation to the server's actions, as the client sees it",
     OF_SERVER: "mean of the time that the server itself measures for an answer",
     "tokens unverified": "executed tokens that the policy neither wrote nor accepted",
     "tokens per verification": "how many tokens one verification yields on average (acceptance length)",
@@ -131,7 +131,7 @@ def cells_of(row: Result, of: Measures | None = None) -> Cells:
         LATENCY: number(of.latency_p95_ms),
         SPEEDS["speedup"]: _speed(row, of.speedup),
         "a decode takes, ms": number(of.felt_latency_ms),
-        ANSWER: number(of.latency_p50_ms) if is_number(of.server_ms) else MISSING,
+        ANSWER: number(of.answer_ms) if is_number(of.server_ms) else MISSING,
         OF_SERVER: number(of.server_ms),
         "steps on a held action": share(of.held_share),
         "tokens per verification": number(of.AL),
