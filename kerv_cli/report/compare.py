@@ -30,13 +30,12 @@ _PROVENANCE = ("host", "device_name", "git_commit", "torch_version", "mujoco_ver
 
 @dataclass
 class ComparedRun:
-    """One of the two things that are compared: a training, or one setting of a run that has episodes.
+    """One side of a comparison: a training, or one setting of a run that has episodes.
 
     Attributes:
         name: Name to print.
-        run: The run.
         label: Label of the setting in the run. Empty for a training.
-        data: Episodes of the run. None before `pairs_to_compare` has read them. Always None for a training.
+        data: Episodes of the run. None before `pairs_to_compare` has read them, and for a training.
     """
 
     name: str
@@ -46,18 +45,12 @@ class ComparedRun:
 
     @property
     def episodes(self) -> pd.DataFrame:
-        """Episodes of the setting."""
         assert self.data is not None
         return self.data.episodes[self.data.episodes["label"] == self.label]
 
 
 def compared_runs(database: Database, name: str) -> list[ComparedRun]:
-    """Return the settings, or the training, that a name on the command line stands for.
-
-    Args:
-        database: The database.
-        name: `ID` stands for every setting of the run with that id, `ID:LABEL` for one setting.
-    """
+    """Return what a name stands for: a training, all settings of a run (`ID`), or one (`ID:LABEL`)."""
     identifier, _, label = name.partition(":")
     run = find_run(database, identifier)
     if not run.has_episodes:
@@ -75,15 +68,9 @@ def compared_runs(database: Database, name: str) -> list[ComparedRun]:
 
 
 def pairs_to_compare(database: Database, first: str, second: str) -> list[tuple[ComparedRun, ComparedRun]]:
-    """Return which settings of two runs to compare with each other.
+    """Return which settings of two runs (`ID` or `ID:LABEL`) to compare with each other: those with the same label.
 
-    Settings with the same label form pairs. If the runs share fewer than two labels, the first run's first setting is
-    compared with each setting of the second run.
-
-    Args:
-        database: The database.
-        first: Id of the first run, or `ID:LABEL` for one of its settings.
-        second: Id of the second run, or `ID:LABEL` for one of its settings.
+    If the runs share fewer than two labels, the first run's first setting is compared with each of the second run's.
     """
     ours, theirs = compared_runs(database, first), compared_runs(database, second)
     if ours[0].run.has_episodes != theirs[0].run.has_episodes:
@@ -103,10 +90,8 @@ def compare(first: ComparedRun, second: ComparedRun) -> Row:
     """Return the differences between two settings or two trainings, as JSON values.
 
     Returns:
-        A dictionary with these keys:
-
         - `first` and `second`: the two names
-        - `settings`: every key whose two values differ, with both values. A value is None where the key is missing.
+        - `settings`: every key whose two values differ, with both values. A missing value is None.
         - `results`: for each measure both values, the change, and the change's 95 % interval if it is known
         - `note`: why there is no ratio of times. Empty if there is a ratio.
     """
@@ -174,10 +159,7 @@ def _interval(change: Estimate, what: str) -> Row:
 
 
 def same_tokens(first: Study, second: Study) -> tuple[int, int]:
-    """Return two counts: shared episodes with equal tokens, and all shared episodes.
-
-    An episode is shared if both studies have an episode with the same label, task and seed.
-    """
+    """Count the episodes (label, task, seed) that both studies have: those with equal tokens, and all."""
     shared = _tokens(first).merge(_tokens(second), on=["label", "task", "seed"])
     return int((shared["tokens_x"] == shared["tokens_y"]).sum()), len(shared)
 

@@ -19,7 +19,6 @@ _AT_ONCE = 100  # episodes in memory at a time
 
 
 def export(run: RunEntry, database: Database, to: str, folder: Path) -> list[Path]:
-    """Export a run of the database to files of one of FORMATS in a folder, and return their paths."""
     if to not in FORMATS:
         raise UnknownName("format", to, FORMATS)
     store = store_of(run, database)
@@ -37,7 +36,6 @@ def export(run: RunEntry, database: Database, to: str, folder: Path) -> list[Pat
 
 
 def _to_parquet(store: Study, frame: pd.DataFrame, folder: Path) -> list[Path]:
-    """Write the episodes of a study to episodes.parquet and their decodes to decodes.parquet."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -23,15 +23,14 @@ from kerv_cli.report import statistics as stats
 from kerv_cli.report.statistics import NO_ESTIMATE, Estimate, PairedCounts
 
 Row = dict[str, Any]
-"""One row of a table as it is written: column name to value."""
 
 MICRO = "micro over tasks"
 MACRO = "macro over difficulty groups"
 ONE_TASK = "one task"
+# Way of averaging -> columns by which episodes are grouped
 _GROUPS = {MICRO: ["label"], MACRO: ["label"], ONE_TASK: ["task", "label"]}
-"""Way of averaging -> columns by which episodes are grouped. Each group becomes one row of a table."""
+# Key of a field's metadata: the measure is the first column's sum over episodes, divided by the second's
 RATIO = "ratio"
-"""Key of a measure's metadata. Its value is two columns of the episodes: their sums are numerator and denominator."""
 
 
 @dataclass(frozen=True)
@@ -40,47 +39,34 @@ class Measures:
 
     Attributes:
         successes: Number of solved initial states. Repeats of an initial state are not counted.
-        success: Success rate.
-        time_per_step_ms: Inference time per control step, milliseconds.
-        time_per_episode_ms: Inference time per episode, milliseconds.
-        phases: Time per control step in milliseconds, by phase of a decode. Keys begin with `ms.`.
+        phases: Milliseconds per control step, by phase of a decode. Keys begin with `ms.`.
         steps_to_success: Mean number of control steps of the episodes that succeeded.
         path_m: Mean length of the end effector's path in the episodes that succeeded, metres.
         jerk: Mean of the episodes' root mean square jerk of the end effector, m/s³.
         near_contact_failure: Share of the failures in which the hand came near the object.
-        latency_p50_ms: Median time of a decode, milliseconds.
-        latency_p95_ms: 95th percentile of the time of a decode, milliseconds.
-        latency_worst_ms: Time of the slowest decode, milliseconds.
-        answer_ms: Mean time of a decode, milliseconds.
-        server_ms: Mean time of an answer as the policy's server measures it, milliseconds.
+        latency_p50_ms: Median time of a decode. `latency_p95_ms` and `latency_worst_ms` are of decodes, too.
+        answer_ms: Mean time of a decode.
+        server_ms: Mean time of an answer as the policy's server measures it.
         AL: Acceptance length, tokens per verification.
         accepted_per_round: Accepted draft tokens per verification.
         AFEP: Mean position of a draft's first rejected token.
-        forwards_per_step: Target forwards per control step.
         skip_rate: Share of decodes whose draft was executed without verification.
         unverified_share: Share of executed tokens that the target did not verify.
         compensation_rate: Share of decodes in which a prediction, not the target, filled in tokens.
         retrieval_share: Share of decodes in which retrieval drafted.
-        deviation: Mean absolute difference between the executed actions and the actions of AR (autoregressive
-            decoding), in normalised units.
-        felt_latency_ms: Mean time in milliseconds that the world went on during a decode.
-        felt_latency_steps: Mean number of control steps that the world went on during a decode.
+        deviation: Mean absolute difference between the executed actions and AR's, in normalised units.
+        felt_latency_ms: Mean time that the world went on during a decode. `felt_latency_steps`: in control steps.
         held_share: Share of control steps that repeated the last action, because no newer one had arrived.
         added: Values of the columns that plugins add, by name.
         counts: Outcomes of the pairs with the baseline.
         mcnemar_p: p-value of McNemar's exact test. NaN if there are no pairs.
         difference: Success rate minus the baseline's success rate.
-        margin: Loss of success, as a share of episodes, below which a setting counts as non-inferior to the baseline.
-        non_inferior: Whether the loss of success is shown to be smaller than `margin`.
-        pairs_to_settle: Number of pairs that would show a loss below `margin`, see `statistics.pairs_to_settle`.
+        margin: Loss of success, as a share of episodes, below which a setting counts as non-inferior.
+        pairs_to_settle: See `statistics.pairs_to_settle`.
         same_run: Whether the two episodes of every pair come from one run.
         same_block: Share of pairs that were measured in one block (side by side in one process).
-        steps: Number of control steps.
-        decodes: Number of decodes.
         deviation_samples: Number of decodes whose deviation was measured.
-        speedup: Speed per control step relative to the baseline, see `measures.speedups`.
-        episode_speedup: Speed per episode relative to the baseline.
-        solved_speedup: Speed per episode relative to the baseline, over the pairs in which both solved the task.
+        speedup: Speed relative to the baseline, see `Speeds`.
     """
 
     successes: int
@@ -127,12 +113,10 @@ class Measures:
 
     @property
     def pairs(self) -> int:
-        """Number of pairs with the baseline."""
         return int(sum(self.counts))
 
     @property
     def is_timed(self) -> bool:
-        """Whether all episodes were timed."""
         return is_number(self.time_per_step_ms)
 
 
@@ -143,24 +127,17 @@ class Result:
     If episodes differ in the value of a text field, the field holds all values, joined by semicolons.
 
     Attributes:
-        label: Label of the setting.
         series: Name shared by all settings that differ only in the value of the study's axis (x axis of its chart).
         unstressed: Label of the same setting without stress.
-        method: The setting's decoding method.
         where: The task of a row of one task. Empty for a row over all tasks.
-        task: Names of the tasks.
         tasks: Number of tasks.
-        difficulty: Difficulty groups of the tasks.
         seeds: Seeds of the episodes, as `seeds_text` writes them.
         baseline: Label of the setting that this setting is compared with.
         measures: Measured values, pooled over all episodes.
-        by_difficulty: The unweighted mean of the values of each difficulty group. None for a row of one task.
+        by_difficulty: The unweighted mean over the difficulty groups. None for a row of one task.
         runs: Number of runs (commands) from which the intervals of speed were computed.
-        overrides: Overrides of the setting, as typed.
         settings: All settings as one dictionary with dotted keys, such as `threshold.r`.
-        observation: What the target observes.
         hashes: Hashes of weights and data, by column (`target_sha256`).
-        stress_level: Level of stress.
         provenance: Machine, versions and the like, by column.
         matched_success_speed: See `tables.with_matched_speed`.
     """
@@ -191,29 +168,26 @@ class Result:
 
     @property
     def is_baseline(self) -> bool:
-        """Whether the row belongs to the baseline itself, which is not compared with anything."""
         return self.label == self.baseline
 
     @property
     def is_compared(self) -> bool:
-        """Whether there are pairs to compare the setting with its baseline. False for the baseline itself."""
         return not self.is_baseline and self.measures.pairs > 0
 
     @property
     def speed(self) -> float:
-        """Speed per episode relative to the baseline. 1 for the baseline itself. NaN if the speed was not measured."""
+        """Speed per episode relative to the baseline, which itself has 1. NaN if the speed was not measured."""
         return 1.0 if self.is_baseline else self.measures.episode_speedup.value
 
     def columns(self) -> Row:
-        """Return the row as columns of a CSV file or a data frame."""
         return columns_of({name: value for name, value in vars(self).items() if name not in ("where", "by_difficulty")})
 
 
 def columns_of(values: Mapping[str, Any]) -> Row:
     """Return named values as columns.
 
-    An `Estimate` NAME becomes three columns: NAME, and NAME_low and NAME_high for the interval. `PairedCounts` become
-    the column `pairs` (number of pairs) and one column per outcome. A mapping becomes one column per key.
+    An `Estimate` NAME becomes NAME, NAME_low and NAME_high. `PairedCounts` become the column `pairs` (their number) and
+    one column per outcome. A mapping becomes one column per key.
     """
     columns: Row = {}
     for name, value in values.items():
@@ -249,16 +223,16 @@ def is_number(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool) and not math.isnan(value)
 
 
+# Metres. In a failure nearer to the object than this, the hand came near it.
 NEAR = 0.02
-"""Distance between hand and object, in metres, below which a failed episode counts as a near-contact failure."""
+# Share of episodes. A setting that loses less success than this is non-inferior to the baseline.
 MARGIN = 0.03
-"""Loss of success, as a share of episodes, below which a setting counts as non-inferior to the baseline."""
 
+# Columns in which two episodes must agree before their times are compared
 COMPARABLE = ("device", "device_name", "dtype", "threads")
-"""Columns in which two episodes must agree before their times are compared."""
 
+# Measure -> (numerator, denominator), each a column summed over episodes. NaN if the denominator is 0.
 _RATIOS = {one.name: one.metadata[RATIO] for one in fields(Measures) if RATIO in one.metadata}
-"""Measure -> (numerator, denominator), each a column summed over episodes. NaN if the denominator is 0."""
 _PHASES = {f"ms.{phase}": f"seconds.{phase}" for phase in PHASES}
 
 
@@ -268,19 +242,15 @@ def measure(
     averaging: str = MICRO,
     speeds: Mapping[Hashable, Speeds] | None = None,
 ) -> dict[Hashable, Measures]:
-    """Return every measure of each group of episodes.
+    """Return every measure of each group of episodes: by label, or with ONE_TASK by task and label.
 
     Args:
         episodes: One row per episode. Columns: those of rows.EPISODE_SCHEMA, `label`, `decode_seconds`, `difficulty`,
             `run`, `block`, and those of `COMPARABLE`.
-        pairs: Pairs of these episodes with the baseline's episodes, from `paired`.
-        averaging: MACRO computes a measure for every difficulty group and returns the unweighted mean of the groups.
-            MICRO and ONE_TASK pool the episodes of a setting. Paired counts, McNemar's p and `pairs_to_settle` are
-            always pooled.
+        pairs: From `paired`.
+        averaging: MACRO returns the unweighted mean of the difficulty groups, MICRO and ONE_TASK pool the episodes.
+            Paired counts, McNemar's p and `pairs_to_settle` are always pooled.
         speeds: Speedups by group. If None, `speedups` computes them from `pairs`.
-
-    Returns:
-        The measures by group: by label, or with ONE_TASK by task and label.
     """
     speeds = speedups(pairs, averaging) if speeds is None else speeds
     if averaging != MACRO:
@@ -321,12 +291,6 @@ def measure(
 
 
 def compared(counts: PairedCounts, difference: Estimate) -> dict[str, Any]:
-    """Return the fields of `Measures` that compare a setting's success with the baseline's.
-
-    Args:
-        counts: Outcomes of the pairs.
-        difference: Success rate of the setting minus the baseline's, with its interval.
-    """
     return {
         "counts": counts,
         "mcnemar_p": stats.mcnemar(counts) if sum(counts) else math.nan,
@@ -337,23 +301,19 @@ def compared(counts: PairedCounts, difference: Estimate) -> dict[str, Any]:
 
 
 def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame:
-    """Pair each setting's episodes with the episodes of its baseline.
-
-    Two episodes form a pair if they have the same task, seed, initial state, device, number format and number
-    of threads.
+    """Pair each setting's episodes with those of its baseline: same task, seed, initial state and `COMPARABLE` columns.
 
     Args:
-        episodes: Episodes of all settings and baselines.
-        baselines: Maps a setting's label to the label of its baseline. Settings without a baseline are left out.
+        baselines: A setting's label -> its baseline's label. Settings without a baseline are left out.
 
     Returns:
-        One row per pair, sorted by task and seed. It has these columns:
+        One row per pair, sorted by task and seed, with these columns:
 
-        - `label`, `task`, `difficulty`, `seed`, `decodes` (whether the setting runs a decoder), `same_run`
-          and `same_block`
-        - for each of the two episodes, with the ending _baseline or _method: `time` (seconds per control step),
-          `seconds` (of the whole episode), `block` and `success`
-        - the four outcomes of `PairedCounts`: 1 for the outcome of this pair, 0 for the three other outcomes.
+        - `label`, `task`, `difficulty`, `seed`, `decodes` (whether the setting runs a decoder), `same_run`,
+          `same_block`
+        - `time` (seconds per control step), `seconds` (of the whole episode), `block` and `success`, each once with the
+          ending _baseline and once with _method
+        - the outcomes of `PairedCounts`: 1 for the outcome of this pair, 0 for the others
     """
     keys = ["task", "seed"]
     columns = ["label", *keys, "run", "block", "success", "seconds", "initial_state", *COMPARABLE]
@@ -384,10 +344,10 @@ class Speeds(NamedTuple):
     """Speedups of a group of pairs: mean time of the baseline ÷ mean time of the method.
 
     Attributes:
-        speedup: Ratio of the mean seconds per control step.
-        episode_speedup: Ratio of the mean seconds per episode.
-        solved_speedup: Ratio of the mean seconds per episode, over the pairs that both solved. A failed episode runs to
-            the horizon, so a single one can decide the other two ratios.
+        speedup: Per control step.
+        episode_speedup: Per episode.
+        solved_speedup: Per episode, over the pairs that both solved. A failed episode runs to the horizon, so a single
+            one can decide the other two.
     """
 
     speedup: Estimate = NO_ESTIMATE
@@ -396,13 +356,10 @@ class Speeds(NamedTuple):
 
 
 def speedups_of_runs(runs: Sequence[pd.DataFrame], averaging: str, same_pairs: bool) -> dict[Hashable, Speeds]:
-    """Return the speedups of each group of pairs, with intervals over the runs (docs/methods.md §7).
-
-    With a single run, return the speedups of that run, with intervals over its episodes.
+    """Return the speedups of each group of pairs, with intervals over the runs, or over episodes if there is one run.
 
     Args:
         runs: One table made by `paired` per run.
-        averaging: See `speedups`.
         same_pairs: Whether all runs measured the same pairs.
     """
     combined, *others = [speedups(pairs, averaging) for pairs in runs]
@@ -415,13 +372,11 @@ def speedups_of_runs(runs: Sequence[pd.DataFrame], averaging: str, same_pairs: b
 def speedups(pairs: pd.DataFrame, averaging: str = MICRO, all_pairs: bool = False) -> dict[Hashable, Speeds]:
     """Return the speedups of each group of pairs.
 
-    A group is left out if it has no usable pairs, if an episode was not timed, or if its setting runs no decoder (the
-    scripted expert).
+    A group is left out if no pair is usable, if an episode was not timed, or if its setting runs no decoder.
 
     Args:
-        pairs: Table made by `paired`.
-        averaging: With ONE_TASK, a group is a task and a label. Otherwise, a group is a label. With MACRO, a mean time
-            is the mean of the difficulty groups' means. Otherwise, a mean time is the mean of all pairs.
+        averaging: With ONE_TASK, groups are by task and label, otherwise by label. With MACRO, a mean time is the mean
+            of the difficulty groups' means.
         all_pairs: Whether to use also pairs that were not measured in one block (side by side in one process).
     """
     timed = pairs if all_pairs else pairs[pairs["same_block"]]
@@ -446,7 +401,6 @@ def speedups(pairs: pd.DataFrame, averaging: str = MICRO, all_pairs: bool = Fals
 
 
 def _means(episodes: pd.DataFrame, by: list[str]) -> pd.DataFrame:
-    """Return the measures, except success, that need no baseline, pooled over each group. Times are in milliseconds."""
     groups = episodes.groupby(by)
     per_step, solved = 1000.0 / episodes["steps"], episodes["success"].astype(bool)
     distances = episodes["closest_approach"].astype(float)

@@ -1,8 +1,7 @@
 """Draw the charts of a study from its rows, and the curves of a training.
 
-A chart has panels side by side. Each point of a panel is a setting and has these fields: `setting`, `line`, `x`,
-`value`, `low` and `high` (95 % interval), `is_baseline`, and the text that hovering shows. When the reader clicks on a
-setting, the page sets the chart's parameter `picked` to the setting's label.
+A point of a panel is a setting, with the fields of `_points`. When the reader clicks on a setting, the page sets the
+chart's parameter `picked` to the setting's label.
 """
 
 from __future__ import annotations
@@ -33,7 +32,6 @@ INK, MUTED, BLUE, GREEN = "#1f2933", "#6b7785", "#0b6fb8", "#2a9d6f"
 COLOURS = (BLUE, "#d1495b", GREEN, "#8d5fd3", "#e08e1b", "#3aa6b9", "#7a5c3e")  # distinct when colour-blind
 SUCCESS, SPEED, DIFFERENCE = "success", "episode_speedup", "difference"
 TITLES = {SUCCESS: "Success, % of episodes", SPEED: "Speed, per episode", DIFFERENCE: "Change in success, points"}
-"""Columns of a study's table that are drawn -> their titles."""
 _WIDTH, _HEIGHT, _ACROSS = 320, 240, 3  # of a panel, in pixels; panels in a row
 _SPREAD = 6.0  # a ratio of speeds above which their axis is logarithmic
 _CONFIG = {
@@ -47,17 +45,15 @@ _CONFIG = {
 
 
 Point = dict[str, Any]
+# A setting's label -> the line through its point, and its x value
 Places = Mapping[str, tuple[str, float | None]]
-"""For each setting's label, the line through its point, and its x value."""
 
 
 class Panel(NamedTuple):
     """One of the charts side by side.
 
     Attributes:
-        title: Title above the panel.
-        points: The points. A point without x is drawn as a line across the panel.
-        xlabel: Title of the x axis.
+        points: A point without x is drawn as a line across the panel.
         names: Names of the places on the x axis, in order. Empty if x is a number.
     """
 
@@ -75,7 +71,6 @@ def study_figures(results: Sequence[Result], axis: str, loss: float = 3.0) -> di
     - Any other study that compares settings (`tradeoff`): speed and change in success of every setting.
 
     Args:
-        results: The study's rows over all tasks.
         axis: Key of a setting for the x axis, such as `threshold.r`. Empty if the study has no axis.
         loss: Largest acceptable loss of success, in points.
     """
@@ -95,7 +90,6 @@ def study_figures(results: Sequence[Result], axis: str, loss: float = 3.0) -> di
 
 
 def about(results: Sequence[Result]) -> str:
-    """Return the subtitle of a page: policies, number of settings, tasks and episodes, device, number format."""
     first = results[0]
     targets = list(dict.fromkeys(str(row.settings["policy.target"]) for row in results))
     names = ", ".join(targets) if len(targets) <= 2 else f"{len(targets)} policies"
@@ -105,10 +99,7 @@ def about(results: Sequence[Result]) -> str:
 
 
 def colours_of(results: Sequence[Result]) -> dict[str, str]:
-    """Return the colour of each setting, by label, and of each series of settings, by name.
-
-    A setting has the same colour in all charts. The settings of a series have shades of one colour. Baselines are dark.
-    """
+    """Return the colour of each setting, by label, and of each series, by name. A series has shades of one colour."""
     series: dict[str, list[str]] = {}
     for row in results:
         series.setdefault(row.series, []).append(row.label)
@@ -130,8 +121,8 @@ def _lighter(colour: str, share: float) -> str:
 def lines_of(results: Sequence[Result], axis: str) -> Places:
     """Return for each label the line that joins its point to others, and the setting's value on the x axis.
 
-    Settings that differ only in the value of `axis` share a line. If a setting's value is no number, or if no other
-    setting shares its line, the line is the setting's label, and x is None.
+    Settings that differ only in the value of `axis` share a line. A setting without such neighbours has its label as
+    line, and x is None.
     """
     places: dict[str, tuple[str, float | None]] = {}
     for row in results:
@@ -142,7 +133,6 @@ def lines_of(results: Sequence[Result], axis: str) -> Places:
 
 
 def _points(results: Sequence[Result], column: str, places: Places) -> list[Point]:
-    """Return the points of a panel that shows one measure of the settings in `places`. Success is in per cent."""
     scale, points = 1.0 if column == SPEED else 100.0, []
     texts = {cells["setting"]: dict(itertools.islice(cells.items(), MAIN)) for cells in summary(results)}
     for row in results:
@@ -166,11 +156,6 @@ def _faded(full: float) -> alt.When:
 
 
 def _tradeoff(results: Sequence[Result], loss: float, colours: Mapping[str, str]) -> alt.ConcatChart:
-    """Draw speed and change in success of every setting in two panels, one row per setting.
-
-    A dashed line marks the baseline's speed in the first panel, and a loss of `loss` points in the second. A setting
-    whose interval is right of the line is shown to be faster than the baseline, or to lose less than `loss`.
-    """
     baselines, labels = {row.baseline for row in results}, [row.label for row in results]
     than = f"than {baselines.copy().pop()}" if len(baselines) == 1 else "than the baseline"
     panels = {
@@ -205,13 +190,6 @@ def _tradeoff(results: Sequence[Result], loss: float, colours: Mapping[str, str]
 
 
 def lines_figure(panels: Sequence[Panel], colours: Mapping[str, str], ylabel: str | None = None) -> alt.ConcatChart:
-    """Draw panels side by side with one legend.
-
-    Args:
-        panels: The panels.
-        colours: Colours of lines and settings.
-        ylabel: Title of the y axis. If None, the y axis has no title.
-    """
     lines = list(dict.fromkeys(point["line"] for panel in panels for point in panel.points))
     scale = alt.Scale(domain=[*lines, *(set(colours) - set(lines))], range=[])
     scale.range = [colours[name] for name in scale.domain]
@@ -238,15 +216,7 @@ def lines_figure(panels: Sequence[Panel], colours: Mapping[str, str], ylabel: st
 
 
 def latency_figure(results: Sequence[Result], latencies: Sequence[Mapping[str, Any]]) -> alt.ConcatChart:
-    """Draw success against decoding latency, with one panel per kind of delay compensation.
-
-    Only settings whose world goes on during a decode are drawn. A setting's x value is the latency of the AR baseline
-    under the same clock. So all methods that ran under the same clock have the same x value.
-
-    Args:
-        results: The study's rows over all tasks.
-        latencies: The same study's `latency_table`.
-    """
+    """Draw success against the AR baseline's latency under the same clock, a panel per delay compensation."""
     panels: dict[str, dict[str, tuple[str, float | None]]] = {}
     for row in latencies:
         if row["ar_latency_ms"] > 0:
@@ -260,11 +230,9 @@ def latency_figure(results: Sequence[Result], latencies: Sequence[Mapping[str, A
 
 
 def acceptance_figure(data: StudyData) -> alt.ConcatChart:
-    """Draw how many draft tokens were accepted, in three panels with a line per setting.
+    """Draw the share of accepted draft tokens by position and by DoF, and how many tokens of a draft were accepted.
 
-    The first two panels show the share of accepted tokens, by position in the draft and by DoF. They count only tokens
-    whose predecessors in the draft were all accepted. The third panel shows the share of drafts with each number of
-    accepted tokens.
+    The shares count only tokens whose predecessors in the draft were all accepted.
     """
     dofs = data.dofs(max(len(tally.reached) for tally in data.tallies.values()))
     places: tuple[list[Point], list[Point], list[Point]] = [], [], []
@@ -305,6 +273,7 @@ def _best_step(log: pd.DataFrame) -> float:
     return float(log["step"].to_numpy()[int(log["score"].to_numpy().argmax())])
 
 
+# Column of a training's log -> its title
 CURVES = {
     "train_loss": "training loss",
     "score": "validation score (the best is kept)",
@@ -314,11 +283,9 @@ CURVES = {
     "acceptance_length_strict": "accepted tokens, equal only",
     "acceptance_length_r9": "accepted tokens, within 9 bins",
 }
-"""Column of a training's log -> its title in a chart."""
 
 
 def curves_figure(log: pd.DataFrame) -> alt.ConcatChart:
-    """Draw every measure of a training's log against the training step. Mark the best validation."""
     best = _best_step(log)
     charts = []
     for name in log.columns.drop("step"):
@@ -350,16 +317,10 @@ def png(figure: alt.ConcatChart, title: str, subtitle: str) -> bytes:
 
 @functools.cache
 def library() -> str:
-    """Return the JavaScript that draws charts in a page (Vega-Embed with Vega and Vega-Lite). It needs no network."""
     return str(vl_convert.javascript_bundle())  # type: ignore[call-arg]  # its stub forgets that it has a default
 
 
 def read_log(folder: Path) -> pd.DataFrame:
-    """Return the log of a training, one row per validation.
-
-    Args:
-        folder: Folder of the trained artifact.
-    """
     path = folder / "log.csv"
     try:
         return pd.read_csv(path)
@@ -368,7 +329,6 @@ def read_log(folder: Path) -> pd.DataFrame:
 
 
 def save_curves(folder: Path) -> Path:
-    """Write `curves.png` into the folder of a trained artifact and return its path."""
     path, log = folder / "curves.png", read_log(folder)
     note = f"{len(log)} validations of the averaged weights; dashed: the saved ones, step {_best_step(log):.0f}"
     write_if_changed(path, png(curves_figure(log), f"{folder.parent.name} {folder.name}", note))

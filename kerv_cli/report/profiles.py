@@ -15,8 +15,8 @@ from kerv_cli.episodes.cost import Profile, read_profile
 
 _SHIPPED = "-profile.json"
 _EIGHT_MS = 0.008  # what HeiSD's encoder takes on an A100 (arXiv 2603.17573)
+# Table column with a speed per episode -> the time that the vision encoder is assumed to take, in words
 ENCODERS = {"encoder_floor": "its floor", "encoder_twice": "twice its floor", "encoder_8ms": "8 ms"}
-"""Table column with a speed per episode -> the time that the vision encoder is assumed to take, in words."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,6 @@ class NamedProfile:
     """The costs of one target on one machine, from `kerv bench`, and the name that the user gave.
 
     Attributes:
-        name: The name by which the user chose it (`on=NAME`).
-        profile: Seconds of each operation of a decode.
         bounds: For `encode`, `prefill` and `verify` (of one further token), what takes most of the time, such as
             `reading` (the weights). Empty if the costs were measured.
     """
@@ -36,12 +34,10 @@ class NamedProfile:
 
     @property
     def is_projected(self) -> bool:
-        """Whether the costs were computed, not measured."""
         return bool(self.profile.about.get("projected"))
 
     @property
     def title(self) -> str:
-        """Target, device and engine, as far as they are known. "projected" follows if the costs were computed."""
         about = self.profile.about
         names = [str(about[key]) for key in ("target", "device_name", "engine") if about.get(key)]
         return ", ".join(names or [self.name]) + (", projected" if self.is_projected else "")
@@ -50,9 +46,8 @@ class NamedProfile:
     def encoders(self) -> dict[str, Profile]:
         """For each key of `ENCODERS`, the same profile with another time of the vision encoder.
 
-        These times are the encoder's floor, twice the floor, and eight milliseconds. The floor is the shortest time
-        that the device's bandwidth and arithmetic allow. The engine's system time is added to each. Empty if the
-        profile does not have the encoder's floor.
+        The floor is the shortest time that the device's bandwidth and arithmetic allow. Empty if the profile has no
+        floor.
         """
         about, phases = self.profile.about, self.profile.phases
         floor, system = about.get("encoder_floor"), float(about.get("encoder_system", 0.0))
@@ -64,13 +59,7 @@ class NamedProfile:
         return profiles
 
     def check(self, tokens: int, kinds: Iterable[str] = (), setting: str = "") -> None:
-        """Refuse a profile that lacks costs.
-
-        Args:
-            tokens: N, number of tokens of the chunks to price.
-            kinds: Kinds of costs that are needed, such as `verify`.
-            setting: Label of the setting whose decodes are priced, for the message. If empty, no setting is named.
-        """
+        """Refuse a profile that lacks a kind of cost, or costs for chunks of N `tokens`, for a `setting`."""
         command = f"kerv bench target={self.profile.about.get('target', 'TARGET')} tokens={tokens}"
         if lacks := self.profile.lacks(kinds):
             reason = f"no cost of '{lacks[0]}'" + (f", which setting '{setting}' needs" if setting else "")
@@ -83,12 +72,7 @@ class NamedProfile:
 
 
 def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfile]:
-    """Read cost profiles.
-
-    Args:
-        results: Results folder.
-        names: Each name is a path, the name of a file in <results>/bench, or the name of a profile that kerv ships.
-    """
+    """Read cost profiles: names are paths, files in <results>/bench, or profiles that kerv ships."""
     folders = (Path(results) / "bench", shipped_dir().parent / "bench")
     profiles = []
     for name in names:

@@ -43,6 +43,7 @@ from kerv_cli.report.tables import RUNTIME, StudyData, differences, flatten, loa
 from kerv_cli.report.verdict import Verdict, caution, order_of, question, verdict_of
 from kerv_cli.report.viewing.viewer import animation, film_of
 
+# A column for each setting that the study varies follows after `overrides`. tables/<study>.json has all other values.
 CSV_COLUMNS = (
     "study", "label", "method", "overrides", "stress", "stress_level", "task", "seeds", "episodes", "baseline",
     "successes", "success", "success_low", "success_high", "runs", "speedup", "speedup_low", "speedup_high",
@@ -52,16 +53,13 @@ CSV_COLUMNS = (
     "mcnemar_p", "difference", "difference_low", "difference_high", "non_inferior", "pairs_to_settle",
     "steps_to_success", "near_contact_failure", "matched_success_speed",
 )  # fmt: skip
-"""Columns of a study's CSV files. After `overrides` follows a column for each setting that the study varies. All other
-values are in tables/<study>.json (`further_of`)."""
+# Points: default for the largest loss of success that the verdict accepts
 LOSS = 3.0
-"""Default for the largest loss of success that the page's verdict accepts, in points."""
+# Films play at half speed. With more than half this many frames, a film plays faster, to stay short and small.
 _FRAMES = 240
-"""Films play at half speed. A film with more than half this number of frames plays faster, to stay short and small."""
 
 
 def to_report(database: Database, study: str | None) -> list[Study]:
-    """Return one study, or every study that has an episode, sorted by name."""
     if study:
         return [Study(database, study)]
     stores = [one for one in studies(database) if one.kind != ROLLOUT and one.counts()[0]]
@@ -75,10 +73,9 @@ class Report:
     """A report on one study: its verdict, charts and written files. Verdict and charts are computed once.
 
     Attributes:
-        data: The study with its tables.
         loss: Largest loss of success, in points, that the verdict accepts.
-        priced: The study's speeds on other machines. Empty if none were estimated.
-        files: Written files, in the order of writing, the page last. Empty if nothing was written.
+        priced: The study's speeds on other machines.
+        files: Written files, the page last.
     """
 
     data: StudyData
@@ -88,16 +85,11 @@ class Report:
 
     @functools.cached_property
     def verdict(self) -> Verdict:
-        """The study's answer."""
         return verdict_of(self.data.results, self.loss)
 
     @property
     def command_to_settle(self) -> str:
-        """The command that runs enough episodes for the verdict to name a setting.
-
-        Empty if the verdict names a setting already, if more episodes would not help, if more than 10,000 pairs would
-        be needed, or if the study is not a sweep.
-        """
+        """The command that runs enough episodes for the verdict to name a setting. Empty if `Verdict.episodes` is 0."""
         study, episodes = self.data.study, self.verdict.episodes
         return study.sweep_command(f"episodes={episodes}") if study.kind == SWEEP and episodes else ""
 
@@ -121,14 +113,11 @@ def report(
     baseline: str = "",
     say: Callable[[str], None] = lambda line: None,
 ) -> list[Report]:
-    """Write the tables and the page of one study, or of every study that has an episode. Return a report of each.
+    """Write the tables and the page of one study, or of every study that has an episode.
 
-    The tables are <study>.csv, <study>_per_task.csv, <study>.json and, if speeds elsewhere are estimated,
-    <study>_on.csv. The same episodes give the same bytes.
+    The same episodes give the same bytes.
 
     Args:
-        database: The database. Files are written to its results folder.
-        study: Name of the study. If None, report on all studies.
         on: Names of cost profiles of other machines. The study's speeds on each are estimated (docs/measuring.md).
         loss: Largest loss of success, in points, that the verdict on the page accepts.
         baseline: Label of the setting to compare with, in place of the study's baseline.
@@ -152,10 +141,8 @@ def write_study(data: StudyData, loss: float, profiles: Sequence[NamedProfile] =
     """Write the tables and the page of one study.
 
     Args:
-        data: The study with all its episodes.
         loss: Largest loss of success, in points, that the verdict accepts.
-        profiles: Cost profiles of the machines for which speeds are estimated. If empty, use the profiles that the
-            study's file names, and measured profiles of the machine that ran the study.
+        profiles: Cost profiles of the machines for which speeds are estimated. If empty, those of `own_profiles`.
     """
     priced = repriced(data, profiles) if profiles else repriced(data, own_profiles(data), lenient=True)
     tables = {"": csv_rows(data, data.results), "_per_task": csv_rows(data, data.task_results)}
@@ -174,7 +161,6 @@ def write_study(data: StudyData, loss: float, profiles: Sequence[NamedProfile] =
 
 
 def csv_rows(data: StudyData, results: Sequence[Result]) -> list[Row]:
-    """Return rows of a study's table with the columns of its CSV files."""
     first, others = CSV_COLUMNS[: CSV_COLUMNS.index("overrides") + 1], CSV_COLUMNS
     names = dict.fromkeys([*first, *data.varied, *others])
     rows = []
@@ -185,7 +171,7 @@ def csv_rows(data: StudyData, results: Sequence[Result]) -> list[Row]:
 
 
 def further_of(data: StudyData) -> dict[str, Any]:
-    """Return the facts about a study that its CSV files leave out, as JSON values (docs/formats.md)."""
+    """Return what a study's CSV files leave out, as JSON values (docs/formats.md)."""
     labels: dict[str, Any] = {}
     for row in [*data.results, *data.task_results]:
         setting = data.settings[row.label]
@@ -219,7 +205,6 @@ def _json_values(measures: Measures, others: Sequence[str] = ()) -> Row:
 
 
 def render(report: Report) -> str:
-    """Return the study's page as one HTML file that needs no other file and no network."""
     loader = PackageLoader("kerv_cli.report", "templates")
     templates = Environment(loader=loader, autoescape=True, undefined=StrictUndefined)
     templates.filters["code"] = with_code
@@ -229,7 +214,6 @@ def render(report: Report) -> str:
 
 
 def study_parts(report: Report) -> dict[str, Any]:
-    """Return the values that the template _study.html shows."""
     data = report.data
     study, rows = data.study, data.results
     suite = suite_table(rows)
@@ -271,10 +255,6 @@ def study_parts(report: Report) -> dict[str, Any]:
 
 
 def _settings(data: StudyData) -> list[dict[str, Any]]:
-    """Return for every setting: label, overrides, reference, and the values that differ from the reference's values.
-
-    The reference is the setting with which this setting is compared.
-    """
     flat = {label: flatten(without(one.settings, NOT_DETERMINING)) for label, one in data.settings.items()}
     settings = []
     for label, own in flat.items():
@@ -285,12 +265,6 @@ def _settings(data: StudyData) -> list[dict[str, Any]]:
 
 
 def _films(data: StudyData) -> list[dict[str, Any]]:
-    """Return for each method a film of its first recorded success and one of its first recorded failure.
-
-    A method without a recorded success, or without a recorded failure, lacks that film. Without Rerun there are no
-    films. A film is a dictionary with the setting's label, the task, the seed, the outcome, the number of steps and
-    the GIF in base64.
-    """
     recorded = {path.name for path in data.study.recordings} if has_rerun() else set()
     outcomes = data.episodes.set_index(["label", "task", "seed"])["success"].to_dict() if recorded else {}
     films: dict[tuple[str, bool], dict[str, Any]] = {}

@@ -23,8 +23,8 @@ from kerv_cli.report.measures import MICRO, Measures, Result, Row, columns_of, m
 from kerv_cli.report.profiles import NamedProfile, open_profiles
 from kerv_cli.report.tables import StudyData
 
+# Columns of a decode that the cost model reads
 READ = ("index", "rounds", "similarity", *map("seconds.{}".format, READ_PHASES))
-"""Columns of a decode that the cost model reads."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,10 @@ class Priced:
     """How fast a setting would be on another machine, estimated from a cost profile (written by `kerv bench`).
 
     Attributes:
-        result: The setting's row of the study's table, as measured, pooled over tasks.
-        machine: The cost profile of the other machine.
-        measures: The measures of `result`, estimated for the machine.
-        encoders: Speeds per episode, estimated under three further assumptions about the time of the vision encoder.
-            The keys are those of `ENCODERS`. Empty if the profile was measured, so that the encoder's time is known.
+        result: The setting's row, as measured.
+        measures: The same, estimated for the machine.
+        encoders: Speeds per episode under other times of the vision encoder, by key of `ENCODERS`. Empty if it is
+            known.
     """
 
     result: Result
@@ -46,7 +45,6 @@ class Priced:
 
 
 def prices_table(priced: Sequence[Priced]) -> list[Row]:
-    """Return the estimated speeds as rows of a table: one per machine and setting."""
     rows = []
     for one in priced:
         result, of, measured = one.result, one.measures, one.result.measures
@@ -62,20 +60,14 @@ def prices_table(priced: Sequence[Priced]) -> list[Row]:
 
 
 def encoders_of(priced: Sequence[Priced]) -> list[str]:
-    """Return the columns of further assumptions about the encoder that some of the estimates have."""
     return list(dict.fromkeys(itertools.chain.from_iterable(one.encoders for one in priced)))
 
 
 def repriced(data: StudyData, profiles: Sequence[NamedProfile], lenient: bool = False) -> list[Priced]:
-    """Estimate how fast every setting would be on the machine of each profile.
+    """Estimate how fast every setting that decodes would be on the machine of each profile.
 
     Args:
-        data: The study's episodes.
-        profiles: For each machine, the seconds that each operation of a decode takes there (`kerv bench`).
         lenient: Leave out a profile that lacks a cost, and settings without times, instead of raising an error.
-
-    Returns:
-        One estimate per profile and setting. Settings that run no decoder are left out.
     """
     if not profiles:
         return []
@@ -111,13 +103,11 @@ def _estimated(data: StudyData, works: Mapping[str, _LabelWork], profile: Profil
 
 
 def own_profiles(data: StudyData, elsewhere: bool = True) -> list[NamedProfile]:
-    """Return the cost profiles of the machines that the study's file names, and of those that ran the study.
+    """Return the profiles of the machines that ran the study, if `kerv bench` measured there.
 
-    For a machine that ran the study, this needs a profile that `kerv bench` measured there. The estimates beside the
-    measured times show how accurate the cost model is. A profile that is missing is left out.
+    Estimates beside the measured times show how accurate the cost model is. Missing profiles are left out.
 
     Args:
-        data: The study.
         elsewhere: Whether to include the machines that the study's file names.
     """
     results, profiles = data.study.database.results, dict[str, NamedProfile]()
@@ -150,7 +140,6 @@ class _LabelWork(NamedTuple):
 
 
 def _work_of_label(data: StudyData, label: str) -> _LabelWork:
-    """Read which operations the decodes of a setting executed, in the order of its episodes."""
     if (batch := data.settings[label].batch) > 1:
         raise UsageError(
             f"setting '{label}' ran {batch} episodes at a time, without times: run it with rollout.batch=1"
@@ -170,10 +159,7 @@ def _work_of_label(data: StudyData, label: str) -> _LabelWork:
 
 
 def _priced(episodes: pd.DataFrame, work: _LabelWork, profile: Profile) -> pd.DataFrame:
-    """Return the episodes with the times that their decodes would take at the profile's costs.
-
-    The columns `seconds` (sum over all decodes) and `decode_seconds` (array with one number per decode) are replaced.
-    """
+    """Return the episodes with the `seconds` and `decode_seconds` of their decodes at a profile's costs."""
     seconds = prices(work.work, profile)
     total = np.bincount(work.episode, seconds, len(episodes))
     order = np.argsort(work.episode, kind="stable")

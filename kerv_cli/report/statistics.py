@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 
 class Estimate(NamedTuple):
-    """An estimated value with the lower and the upper end of its confidence interval (95 % by default)."""
+    """An estimated value with the ends of its 95 % confidence interval."""
 
     value: float
     low: float
@@ -21,16 +21,13 @@ class Estimate(NamedTuple):
 
 
 class PairedCounts(NamedTuple):
-    """Counts of the four possible outcomes of a pair.
+    """Counts of the four possible outcomes of a pair. Expected counts may be fractions.
 
-    A pair is one episode of the baseline and one of the method, from the same initial state. Expected counts may be
-    fractions.
+    A pair is one episode of the baseline and one of the method, from the same initial state.
 
     Attributes:
-        both: Pairs in which both succeeded.
         only_baseline: Pairs in which only the baseline succeeded.
         only_method: Pairs in which only the method succeeded.
-        neither: Pairs in which both failed.
     """
 
     both: float
@@ -40,23 +37,14 @@ class PairedCounts(NamedTuple):
 
 
 NO_ESTIMATE = Estimate(math.nan, math.nan, math.nan)
+# Messages say "more than 10,000" above this, because nobody runs so many pairs.
 MOST_PAIRS = 10_000
-"""Above this number of pairs, messages say only "more than 10,000", because nobody runs so many pairs."""
 
 
 def wilson(successes: float, episodes: float, confidence: float = 0.95) -> Estimate:
-    """Estimate a success rate with its Wilson score interval.
+    """Estimate a success rate with its Wilson score interval (Newcombe, Statistics in Medicine 17, 1998, method 3).
 
-    Source: Newcombe, Statistics in Medicine 17 (1998), method 3. The formula is written out here because importing
-    `scipy.stats` takes 60 MB of memory.
-
-    Args:
-        successes: Number of successful episodes.
-        episodes: Number of all episodes.
-        confidence: Coverage of the interval.
-
-    Returns:
-        The rate `successes / episodes` with its interval. All three numbers are NaN if `episodes` is 0.
+    It is written out here because importing `scipy.stats` takes 60 MB of memory.
     """
     if episodes == 0:
         return NO_ESTIMATE
@@ -69,17 +57,10 @@ def wilson(successes: float, episodes: float, confidence: float = 0.95) -> Estim
 
 
 def mean_of(groups: Sequence[Estimate]) -> Estimate:
-    """Estimate the unweighted mean of independent estimates, such as the success rates of several groups of tasks.
+    """Estimate the unweighted mean of independent estimates. Unknown ones (NaN) are left out.
 
     The distance from the mean to an end of its interval is √(sum of the groups' squared distances) / number of groups
     (method of variance estimates recovery: Zou and Donner, Statistics in Medicine 27, 2008).
-
-    Args:
-        groups: One estimate per group. It is NaN if the group's value is unknown. All intervals have the same
-            confidence, and so has the result's interval.
-
-    Returns:
-        The mean of the known estimates with its interval. All three numbers are NaN if no estimate is known.
     """
     table = np.array(groups)
     known = table[~np.isnan(table[:, 0])]
@@ -93,17 +74,10 @@ def mean_of(groups: Sequence[Estimate]) -> Estimate:
 
 
 def paired_difference(counts: PairedCounts) -> Estimate:
-    """Estimate the method's success rate minus the baseline's, from pairs of episodes.
+    """Estimate the method's success rate minus the baseline's, from −1 to 1. NaN if there are no pairs.
 
     The interval is Newcombe's hybrid score interval for paired proportions (Statistics in Medicine 17, 1998, method
     10). It combines the Wilson intervals of the two rates and takes their correlation φ into account.
-
-    Args:
-        counts: Outcomes of the pairs.
-
-    Returns:
-        The difference, from −1 to 1, with its interval. It is negative if the method succeeds less often. All three
-        numbers are NaN if there are no pairs.
     """
     pairs = sum(counts)
     if not pairs:
@@ -128,16 +102,11 @@ def paired_difference(counts: PairedCounts) -> Estimate:
 def pairs_to_settle(counts: PairedCounts, margin: float) -> float:
     """Estimate how many pairs in all would show that the method loses less than `margin` of success (non-inferiority).
 
-    The estimate assumes that the shares of the four outcomes stay as observed. The result is the smallest number of
-    pairs for which the lower end of `paired_difference` is above −margin.
+    It is the smallest number for which the lower end of `paired_difference` is above −margin, if the shares of the four
+    outcomes stay as observed. Infinite if ten million pairs would not be enough. NaN if there are no pairs.
 
     Args:
-        counts: Observed outcomes of the pairs.
-        margin: Largest acceptable loss of success, as a share of episodes (0.03 stands for three points).
-
-    Returns:
-        The total number of pairs, including those already run. Infinite if ten million pairs would not be enough. NaN
-        if there are no pairs.
+        margin: Share of episodes: 0.03 is three points.
     """
     pairs = sum(counts)
     if not pairs:
@@ -154,14 +123,7 @@ def pairs_to_settle(counts: PairedCounts, margin: float) -> float:
 def mcnemar(counts: PairedCounts) -> float:
     """Return the two-sided p-value of McNemar's exact test (McNemar, Psychometrika 12, 1947).
 
-    The test uses only the pairs in which exactly one of the two episodes succeeded. Under the null hypothesis, the
-    method wins each of these pairs with probability 1/2. The number of pairs that the method wins is then binomial.
-
-    Args:
-        counts: Outcomes of the pairs.
-
-    Returns:
-        The p-value. It is 1 if no pair has exactly one success.
+    It is 1 if no pair has exactly one success.
     """
     from scipy.special import bdtr
 
@@ -180,23 +142,15 @@ def speedup(
 
     The 95 % interval is computed for the ratio's logarithm, linearised, in a stratified cluster sample (Cochran,
     Sampling Techniques, 1977). The strata are the tasks. The clusters are blocks: episodes that ran together in one
-    process and so share the state of the machine. In two cases the clusters are not the blocks:
-
-    - If every task has only one block, the tasks are the clusters.
-    - If there is only one block in all, its pairs are the clusters. The interval then holds only for the state that the
-      machine was in.
+    process and so share the state of the machine. If every task has only one block, the tasks are the clusters. If
+    there is only one block in all, its pairs are. The interval then holds only for the state that the machine was in.
 
     Args:
         baseline: (pairs,) time of the baseline's episodes, in any unit.
         method: (pairs,) time of the method's episodes from the same initial states, in the same unit.
         strata: (pairs,) task of each pair.
-        groups: (pairs,) difficulty group of each pair. If given, each mean time is the unweighted mean of the groups'
-            means. If None, it is the mean of all pairs.
+        groups: (pairs,) difficulty group of each pair. If given, mean times are unweighted means of the groups' means.
         blocks: (pairs,) block of each pair. If None, every pair counts as a block of its own.
-
-    Returns:
-        The speedup with its interval. All three numbers are NaN if there are no pairs. The ends of the interval are NaN
-        if there is only one pair.
     """
     a, b = np.asarray(baseline, dtype=np.float64), np.asarray(method, dtype=np.float64)
     if a.size == 0:
@@ -216,15 +170,13 @@ def speedup(
 
 
 def over_runs(estimates: Sequence[Estimate], same_pairs: bool) -> Estimate:
-    """Combine the speedups that several runs measured.
+    """Combine the speedups that several runs measured: their geometric mean.
 
-    The value is the geometric mean of the k speedups. Its 95 % interval is computed for the logarithm, by Student's t
-    with k − 1 degrees of freedom. If all runs have the same pairs, the spread of the runs does not show how much the
-    choice of pairs matters. In this case the half width is √(a² + b²), where a is the half width by Student's t, and b
-    is the mean of the runs' half widths.
+    The 95 % interval is computed for the logarithm, by Student's t with k − 1 degrees of freedom. If all runs have the
+    same pairs, their spread does not show how much the choice of pairs matters. Then the mean of the runs' half widths
+    is added in quadrature.
 
     Args:
-        estimates: The speedup in each run, with the interval over the run's pairs.
         same_pairs: Whether all runs measured the same pairs. If not, each run has its own seeds.
     """
     from scipy.special import stdtrit
@@ -239,21 +191,16 @@ def over_runs(estimates: Sequence[Estimate], same_pairs: bool) -> Estimate:
 
 
 def _spread(effects: np.ndarray, strata: np.ndarray, clusters: np.ndarray) -> float:
-    """Return half the width of the 95 % interval of the logarithm of a speedup.
+    """Return half the width of the 95 % interval of the logarithm of a speedup. NaN without degrees of freedom.
 
-    A pair is a baseline episode and a method episode from the same initial state. Pairs in different clusters are
-    independent. The effects are summed within each cluster. The variance of a stratum is estimated from the spread of
-    these sums. Then the variances of the strata are added. Strata with only one cluster are merged into one stratum
-    (Cochran, Sampling Techniques, section 5A.12). The half width is the standard deviation times the 97.5 % quantile of
-    Student's t. The degrees of freedom are the number of clusters minus the number of strata.
+    Effects are summed within each cluster; the spread of these sums is a stratum's variance. Strata with one cluster
+    are merged (Cochran, Sampling Techniques, section 5A.12). The degrees of freedom of Student's t are the number of
+    clusters minus the number of strata.
 
     Args:
-        effects: (n,) effect of each pair on the logarithm of the speedup, to first order. The n effects sum to 0.
+        effects: (n,) effect of each pair on the logarithm of the speedup, to first order. They sum to 0.
         strata: (n,) number of each pair's stratum (task), from 0.
         clusters: (n,) number of each pair's cluster (block), from 0. A cluster is in one stratum.
-
-    Returns:
-        The half width. NaN if there are no degrees of freedom, for example with a single cluster.
     """
     from scipy.special import stdtrit
 

@@ -29,22 +29,22 @@ from kerv_cli.report.tables import StudyData
 MISSING = "–"
 APART = "*"
 SPEEDS = {"episode_speedup": "speed, per episode", "speedup": "speed, per step"}
-"""Table column of each kind of speed -> its heading."""
 DIFFERENCE = "change in success"
 LATENCY = "slowest 5 % of decodes, ms"
+# One row of a printed table: heading to text. All rows of a table have the same headings.
 Cells = dict[str, str]
-"""One row of a printed table: heading to text. All rows of a table have the same headings."""
+# Columns that are always shown. `--all`, and "more columns" on the page, show the others.
 MAIN = 5
-"""Number of columns that are always shown. `--all`, and "more columns" on the page, show all other columns."""
 _TASK_COLUMNS = (
     "task", "success", "steps per episode", "forwards per step", "tokens per verification", "drafts accepted",
     "time per step, ms",
 )  # fmt: skip
+# Width at which a heading is wrapped, in characters
 _HEADING = 12
-"""Width at which a heading is wrapped, in characters."""
+# Width at which a label is wrapped, in characters
 _LABEL = 16
-"""Width at which a label is wrapped, in characters."""
 ANSWER, OF_SERVER = "an answer takes, ms", "of it the server's, ms"
+# Heading -> what the column means. `{0}` is the baseline.
 MEANINGS = {
     "success": "share of episodes that solved their task",
     DIFFERENCE: "points more or less than {0}, over pairs: episodes of both from the same initial state",
@@ -62,7 +62,6 @@ MEANINGS = {
     "pairs lost / won": "initial states that only {0}, and only the setting, solved",
     "success, by difficulty": "unweighted mean over the groups of tasks; all other columns pool all tasks",
 }
-"""Heading -> what the column means. `{0}` is the baseline."""
 ASSUMES = (
     "Speed against the baseline by the cost model: the recorded decodes at a profile's costs, as if the other machine "
     "and target decoded the same tokens in the same control steps; success is the recorded policy's"
@@ -70,25 +69,21 @@ ASSUMES = (
 
 
 def number(value: float) -> str:
-    """Return a value as text with three significant digits and no exponent. The text is `–` if the value is missing."""
     if not is_number(value):
         return MISSING
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:#.3g}"
 
 
 def share(value: float) -> str:
-    """Return a value from 0 to 1 as text in per cent. The text is `–` if the value is missing."""
     return f"{100 * value:.0f} %" if is_number(value) else MISSING
 
 
 def interval(estimate: Estimate, form: str = ".2f", unit: str = "", scale: float = 1.0, between: str = "–") -> str:
-    """Return an estimate as text, with its interval in brackets. The text is `–` if the estimate is missing.
+    """Return an estimate as text, with its interval in brackets. `–` if it is missing.
 
     Args:
-        estimate: The estimate.
-        form: Python format of the numbers. With `.0f`, the value still gets one decimal, unless that decimal is 0. So
-            99.5 % success does not become 100 %. With `.2f`, an estimate of 10 or more gets only one decimal.
-        unit: Text after the value.
+        form: Python format of the numbers. With `.0f`, the value still gets one decimal, unless that is 0, so 99.5 %
+            success does not become 100 %. With `.2f`, an estimate of 10 or more gets only one.
         scale: Factor for value and interval, such as 100 for per cent.
         between: Text between the two ends of the interval.
     """
@@ -102,11 +97,6 @@ def interval(estimate: Estimate, form: str = ".2f", unit: str = "", scale: float
 
 
 def _speed(row: Result, speed: Estimate) -> str:
-    """Return a speed as text.
-
-    The text for the baseline is `1×`, or `–` if the baseline was not timed. Pairs that were not measured side by side
-    in one block do not count. An asterisk marks a speed with such pairs.
-    """
     measures = row.measures
     if row.is_baseline:
         return "1×" if measures.is_timed else MISSING
@@ -115,10 +105,9 @@ def _speed(row: Result, speed: Estimate) -> str:
 
 
 def cells_of(row: Result, of: Measures | None = None) -> Cells:
-    """Return a row of a study's table as a dictionary from heading to text. The first `MAIN` are always shown.
+    """Return a row of a study's table as text, by heading. The first `MAIN` are always shown.
 
     Args:
-        row: The row.
         of: The measures to show. If None, those that are pooled over all episodes.
     """
     of = of or row.measures
@@ -150,7 +139,7 @@ def cells_of(row: Result, of: Measures | None = None) -> Cells:
 
 
 def summary(results: Sequence[Result]) -> list[Cells]:
-    """Return a study's table as text: the main columns, and every other column with a value that is not 0 or empty."""
+    """Return a study's table as text: the main columns, and all others with a value that is not 0 or empty."""
     rows = list(map(cells_of, results))
     names = list(rows[0])
     used = [name for name in names if name in names[:MAIN] or {row[name] for row in rows} - {MISSING, "0 %", ""}]
@@ -158,7 +147,6 @@ def summary(results: Sequence[Result]) -> list[Cells]:
 
 
 def columns_shown(rows: Sequence[Cells]) -> set[str]:
-    """Return the headings whose columns have a value."""
     return {name for name in rows[0] if {row[name] for row in rows} - {MISSING, ""}}
 
 
@@ -167,7 +155,6 @@ class SummaryTable:
     """A study's table as `rich` prints it.
 
     Attributes:
-        results: The study's rows over all tasks.
         all: Print every column. If they do not fit side by side, they are printed in several parts.
         how: What to type to see every column. If empty, the table does not mention hidden columns.
     """
@@ -177,7 +164,6 @@ class SummaryTable:
     how: str = ""
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
-        """Yield the title, the table and the notes below it."""
         results = self.results
         first = results[0]
         tasks, episodes = (max(map(attrgetter(name), results)) for name in ("tasks", "episodes"))
@@ -201,12 +187,7 @@ class SummaryTable:
 
 
 def note_of(results: Sequence[Result], names: Sequence[str] = ()) -> str:
-    """Return the note below a table. It explains only columns that the table shows.
-
-    Args:
-        results: The study's rows over all tasks.
-        names: Headings that the table shows. If empty, all columns with values.
-    """
+    """Return the note below a table. It explains only the columns in `names`; if empty, all columns with values."""
     shown = columns_shown(summary(results)) & set(names or cells_of(results[0]))
     notes = ["In brackets: 95 % intervals."]
     if any(row.is_compared for row in results):
@@ -237,7 +218,7 @@ def _heading(name: str) -> str:
 
 
 def _parts(rows: Sequence[Cells], names: Sequence[str], width: int) -> Iterator[list[str]]:
-    """Cut a table's columns into parts that fit into `width` characters. The first part has label, success, speed."""
+    """Cut a table's columns into parts that fit into `width` characters. The first has label, success, speed."""
     widths = {name: 2 + max(map(len, [*_heading(name).split("\n"), *(row[name] for row in rows)])) for name in names}
     labels = " ".join(row["setting"] for row in rows)
     label = min(widths["setting"], 2 + max(_LABEL, *map(len, labels.split())))
@@ -253,8 +234,7 @@ def _parts(rows: Sequence[Cells], names: Sequence[str], width: int) -> Iterator[
 def not_in_turn(results: Sequence[Result]) -> list[str]:
     """Return the labels of the settings that were timed but have no speedup.
 
-    A setting has no speedup if the two episodes of each pair ran in different blocks. A block is episodes that ran side
-    by side in one process.
+    The two episodes of each of their pairs did not run side by side in one process (a block).
     """
     apart: dict[str, None] = {}
     for row in results:
@@ -268,11 +248,7 @@ def not_in_turn(results: Sequence[Result]) -> list[str]:
 
 
 def setting_tables(data: StudyData) -> Iterator[tuple[Any, Any, str]]:
-    """Yield the tables of a study with one setting: results per task, and time per phase of a decode.
-
-    Yields:
-        Column names, rows and title of each table.
-    """
+    """Yield column names, rows and title of the tables of a study with one setting: per task, per phase of a decode."""
     episodes, setting = data.episodes, data.study.settings[0]
     rows = []
     for row in [*data.task_results, *data.results]:
@@ -302,10 +278,7 @@ def setting_tables(data: StudyData) -> Iterator[tuple[Any, Any, str]]:
 
 
 def suite_table(results: Sequence[Result]) -> list[Cells]:
-    """Return the page's table of settings.
-
-    If the tasks have several difficulty groups, further columns have the unweighted mean of the groups.
-    """
+    """Return the page's table of settings. With several difficulty groups, further columns have their mean."""
     rows = summary(results)
     if any(";" in row.difficulty for row in results):
         for cells, row in zip(rows, results, strict=True):
@@ -315,10 +288,7 @@ def suite_table(results: Sequence[Result]) -> list[Cells]:
 
 
 def task_table(results: Sequence[Result]) -> list[Cells]:
-    """Return the page's table of successes and speeds per episode, by task and setting.
-
-    Tasks are rows and settings are columns, unless there are more settings than tasks.
-    """
+    """Return the page's table of successes and speeds, by task and setting. The longer list has the rows."""
     cells: dict[tuple[str, str], str] = {}
     for row in results:
         speed = row.measures.episode_speedup.value
@@ -331,11 +301,6 @@ def task_table(results: Sequence[Result]) -> list[Cells]:
 
 
 def repriced_summary(priced: Sequence[Priced]) -> list[Cells]:
-    """Return a table of measured and estimated speeds: one row per setting, some columns per machine.
-
-    If a machine's profile was computed instead of measured, one more column holds the speeds under further assumptions
-    about the time of the vision encoder, see `ENCODERS`.
-    """
     rows: dict[str, Cells] = {}
     for row in priced:
         machine, is_baseline = row.machine.title, row.result.is_baseline
@@ -352,5 +317,4 @@ def repriced_summary(priced: Sequence[Priced]) -> list[Cells]:
 
 
 def with_code(text: str) -> markupsafe.Markup:
-    """Return a text as HTML. Words in backticks become <code> elements. Templates use this function as a filter."""
     return markupsafe.Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(markupsafe.escape(text))))

@@ -44,15 +44,15 @@ _PROVENANCE = (
 )  # fmt: skip
 
 
+# Smallest success rate at which the baseline counts as solving its tasks
 SOLVED = 0.20
-"""Smallest success rate at which the baseline counts as solving its tasks."""
 NO_STRESS = "none"
 _AT_ONCE = 200  # episodes in memory at a time
+# Episodes of a setting whose decodes are read, to count accepted tokens by position and DoF
 MOST_TALLIED = 500
-"""Number of episodes of a setting whose decodes are read, to count accepted tokens by position and DoF."""
 NO_TALLY = Tally.of_records((), 0)
+# Columns in which runs must agree. Otherwise their speeds are not averaged.
 _ONE_STATE = ("engine", "git_commit", "device_name")
-"""Columns in which runs must agree. Otherwise their speeds are not averaged."""
 
 
 @dataclass(frozen=True)
@@ -60,16 +60,13 @@ class StudyData:
     """A study (settings that are compared) with its stored episodes. Tables are computed on first use and then kept.
 
     Attributes:
-        study: The settings, and the episodes that the study asks for.
-        episodes: One row per stored episode (label, task and seed). Columns: those of `Study.frame`, and
-            difficulty, device, number format and threads.
-        runs: One table like `episodes` per run. A run is one command, such as one `kerv sweep`. All runs used the same
-            code on the same kind of device. If `same_pairs` is true, each run measured all episodes of the study. If it
-            is false, each run measured all settings and tasks, on seeds that no other run used. Empty if there are
-            fewer than three such runs.
-        same_pairs: Whether each run measured all episodes of the study.
-        against: Suffix of the names of tables and page, such as `_against_ar`, if the user chose another baseline than
-            the study's own baseline. Otherwise empty.
+        episodes: One row per stored episode. Columns: those of `Study.frame`, difficulty, device, number format,
+            threads.
+        runs: One table like `episodes` per run (command), all of the same code on the same kind of device. Empty if
+            there are fewer than three.
+        same_pairs: Whether each run measured all episodes of the study. If not, each measured all settings and tasks,
+            on seeds that no other run used.
+        against: Suffix of the names of tables and page, such as `_against_ar`. Empty for the study's own baseline.
     """
 
     study: Study
@@ -80,28 +77,24 @@ class StudyData:
 
     @functools.cached_property
     def settings(self) -> dict[str, Setting]:
-        """The settings by label."""
         return dict(zip(self.study.labels, self.study.settings, strict=True))
 
     @functools.cached_property
     def labels(self) -> list[str]:
-        """Labels of the settings that have episodes, in the study's order."""
         present = set(self.episodes["label"])
         return [label for label in self.study.labels if label in present]
 
     @property
     def absent(self) -> list[Episode]:
-        """Episodes that the study asks for and that have not been stored yet."""
+        """Episodes that the study asks for and that are not stored yet."""
         present = set(self.episodes[["label", "task", "seed"]].itertuples(index=False, name=None))
         return [one for one in self.study.episodes if (one.setting.label, *one.key[1:]) not in present]
 
     @functools.cached_property
     def references(self) -> dict[str, str]:
-        """For each setting's label, the label of the setting that it is compared with (`references_of`)."""
         return references_of(self.study.settings, self.study.baseline)
 
     def compared_with(self, label: str) -> StudyData:
-        """Return the study with the setting `label` as baseline. The tables are then named NAME_against_LABEL."""
         if label not in self.settings:
             raise UsageError(f"baseline={label}: '{self.study.name}' has the settings {', '.join(self.labels)}")
         against = f"_against_{re.sub(r'[^A-Za-z0-9.]+', '_', label)}"
@@ -109,15 +102,13 @@ class StudyData:
 
     @property
     def name(self) -> str:
-        """Name of the study's tables."""
         return f"{self.study.name}{self.against}"
 
     @functools.cached_property
     def unstressed(self) -> dict[str, str]:
         """For each setting's label, the label of the same setting without stress.
 
-        If the study does not run the setting without stress, the value is the label of the first setting that differs
-        only in stress and `rollout.*`.
+        If the study does not run that, the first setting that differs only in stress and `rollout.*`.
         """
         first, found = dict[str, str](), {}
         for setting in sorted(self.study.settings, key=lambda one: stress_of(one.settings)["level"] > 0):
@@ -127,20 +118,17 @@ class StudyData:
 
     @functools.cached_property
     def pairs(self) -> pd.DataFrame:
-        """Episodes of each setting, paired with the episodes of its reference setting (`references`)."""
         return paired(self.episodes, self.references)
 
     @functools.cached_property
     def pairs_of_runs(self) -> list[pd.DataFrame]:
-        """The table `pairs` of each run in `runs`. If `runs` is empty, one table `pairs` over all episodes."""
         return [paired(run, self.references) for run in self.runs] or [self.pairs]
 
     @functools.cached_property
     def by_speed(self) -> list[tuple[str, Estimate]]:
-        """The timed settings by label, the fastest per episode first.
+        """The timed settings, the fastest first, each with its speed per episode relative to the next slower one.
 
-        Each label comes with the speed per episode relative to the next slower setting. The slowest setting has NaN.
-        Empty if the settings are compared with several baselines, or if fewer than two settings were timed.
+        Empty if the settings are compared with several baselines, or if fewer than two were timed.
         """
         timed = [row for row in self.results if is_number(row.speed)]
         if len(timed) < 2 or len(set(self.references.values())) > 1:
@@ -153,10 +141,7 @@ class StudyData:
 
     @functools.cached_property
     def tallies(self) -> dict[str, Tally]:
-        """How many draft tokens were accepted, for each setting that verified drafts.
-
-        Reads the decodes of at most `MOST_TALLIED` episodes of each setting, the first seeds of every task.
-        """
+        """How many draft tokens each setting accepted, over its first `MOST_TALLIED` seeds."""
         tallies = {}
         for label in self.labels:
             own = self.episodes[self.episodes["label"] == label]
@@ -171,40 +156,30 @@ class StudyData:
 
     @functools.cached_property
     def results(self) -> list[Result]:
-        """One row per setting, over all tasks, in the study's order."""
         return with_matched_speed(_results(self, MICRO))
 
     @functools.cached_property
     def task_results(self) -> list[Result]:
-        """One row per task and setting. Tasks are sorted by name, settings are in the study's order."""
         return with_matched_speed(_results(self, ONE_TASK))
 
     @functools.cached_property
     def latencies(self) -> list[Row]:
-        """The rows of settings whose world goes on during a decode (`latency_table`)."""
         return latency_table(self.results)
 
     @property
     def varied(self) -> list[str]:
-        """Keys of the settings that the study varies, such as `threshold.r`."""
         keys = dict.fromkeys(itertools.chain.from_iterable(one.varies for one in self.study.settings))
         return list(keys | ({self.study.axis: None} if "." in self.study.axis else {}))
 
     def dofs(self, number: int) -> Sequence[str]:
-        """Names of the `number` DoFs of an action."""
         return dof_names(str(self.episodes["task"].iloc[0]), number)
 
 
 def references_of(settings: Sequence[Setting], baseline: str) -> dict[str, str]:
     """Return for each setting's label the label of the setting that it is compared with.
 
-    The baseline's method may run several times in a study, under different conditions (stress and `rollout.*`, such as
-    the clock). A setting is compared with the baseline's method under its own conditions, if the study has that.
-    Otherwise the setting is compared with the study's baseline.
-
-    Args:
-        settings: The study's settings.
-        baseline: Label of the study's baseline.
+    That is the baseline's method under the setting's own conditions (stress and `rollout.*`, such as the clock), if the
+    study has it. Otherwise it is the study's baseline.
     """
     same: dict[str, str] = {}
     for own in settings:
@@ -229,8 +204,8 @@ def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyDa
     """Read a study and its stored episodes.
 
     Args:
-        study: The study. If `wanted` is None, only its name matters: its settings and episodes are read again.
-        wanted: Episodes to read. Settings without any of these episodes are left out. If None, read all episodes.
+        study: If `wanted` is None, only its name matters: its settings and episodes are read again.
+        wanted: Episodes to read. Settings without any of them are left out.
     """
     if wanted is None:
         study = study.load()
@@ -250,10 +225,7 @@ def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyDa
 
 
 def _with_new_seeds(episodes: pd.DataFrame) -> list[pd.DataFrame]:
-    """Return one table of episodes per run, the oldest run first, if the runs have different seeds.
-
-    Return an empty list if two runs share a seed on a task, or if a run lacks a setting on a task.
-    """
+    """Return one table per run, the oldest first. Empty if runs share a seed, or one lacks a setting on a task."""
     worlds = episodes[["run", "task", "seed"]].drop_duplicates()
     cells = episodes[["run", "label", "task"]].drop_duplicates()
     every = cells["label"].nunique() * cells["task"].nunique()
@@ -281,7 +253,6 @@ def dof_names(task: str, number: int) -> Sequence[str]:
 
 
 def difficulty_of(task: str) -> str:
-    """Return the task's difficulty group, or `other` if no environment has the task."""
     for spec in specs().values():
         if task in spec.tasks:
             return spec.tasks[task].difficulty
@@ -289,8 +260,6 @@ def difficulty_of(task: str) -> str:
 
 
 def _results(data: StudyData, averaging: str) -> list[Result]:
-    """Return a row per setting (MICRO), or per task and setting (ONE_TASK), in the study's order."""
-
     def measured(way: str) -> Mapping[Any, Measures]:
         speeds = speedups_of_runs(data.pairs_of_runs, way, data.same_pairs)
         return measure(data.episodes, data.pairs, way, speeds)
@@ -336,14 +305,9 @@ def _results(data: StudyData, averaging: str) -> list[Result]:
 def with_matched_speed(rows: Sequence[Result]) -> list[Result]:
     """Add the matched-success speed: one number per method and baseline, the same in each of the method's rows.
 
-    It says how fast a method is at its fastest setting that keeps success (docs/methods.md §7; from WA-SpecDec,
-    arXiv 2608.08725). Settings are tested in order of `safety`, with a margin of 3 points, until one fails (`passing`).
-    The settings before it keep success. The matched-success speed is the largest `episode_speedup` of these
-    settings. It is missing if no setting passes, or if the settings that pass were not timed. It is also missing for
-    the baseline itself, and if the baseline does not solve the tasks.
-
-    Args:
-        rows: One row per setting, or per setting and task.
+    It says how fast a method is at its fastest setting that keeps success (docs/methods.md §7; from WA-SpecDec, arXiv
+    2608.08725), that is, passes `passing` in order of `safety` with a margin of 3 points. It is NaN if no timed setting
+    passes, for the baseline itself, and if the baseline does not solve the tasks.
     """
     solved, groups = set(), dict[tuple[str, str, str], list[Result]]()
     for row in rows:
@@ -364,11 +328,10 @@ def with_matched_speed(rows: Sequence[Result]) -> list[Result]:
 
 
 def safety(row: Result) -> tuple[float, float]:
-    """Return a key that sorts settings, the safest first. The key does not depend on success.
+    """Return a key that sorts settings, the safest first. Success does not influence it.
 
-    The unverified share is the share of executed tokens that the target has not verified, rounded to whole per cent.
-    Settings with a smaller unverified share come first. Settings that decode nothing come last. Of settings with equal
-    shares, the one with the most target forwards per control step comes first.
+    Fewer unverified tokens (in whole per cent) are safer, then more forwards per step. Settings that decode nothing
+    come last.
     """
     unverified = row.measures.unverified_share
     return (1.0 if math.isnan(unverified) else round(unverified, 2), -row.measures.forwards_per_step)
@@ -377,11 +340,10 @@ def safety(row: Result) -> tuple[float, float]:
 def passing(rows: Iterable[Result], loss: float) -> list[Result]:
     """Test, in order, whether each setting loses less than `loss`. Return the rows before the first failed test.
 
-    A setting passes if the lower bound of its difference in success from the baseline is above −`loss`. All tests
-    together have the error rate of one test, because testing stops at the first failure (fixed-sequence testing).
+    All tests together have the error rate of one test, because testing stops at the first failure (fixed-sequence
+    testing).
 
     Args:
-        rows: Rows of a table, in the order of the tests.
         loss: Largest acceptable loss of success, as a share of episodes.
     """
     passed = []
@@ -401,10 +363,7 @@ def _series_of(setting: Setting, axis: str) -> str:
 
 
 def flatten(settings: Plain) -> Row:
-    """Return nested settings as one dictionary with dotted keys, such as `threshold.r`.
-
-    The values of a list become one text, separated by semicolons.
-    """
+    """Return nested settings with dotted keys, such as `threshold.r`. Lists become text, joined by `;`."""
     values = flat(settings)
     for key, value in values.items():
         if isinstance(value, list | tuple):
@@ -413,10 +372,7 @@ def flatten(settings: Plain) -> Row:
 
 
 def differences(first: Row, second: Row) -> list[Row]:
-    """Return the keys whose values differ, as dictionaries with `key`, `first` and `second`.
-
-    If one of the dictionaries lacks the key, its value is None.
-    """
+    """Return the keys whose values differ, as `key`, `first` and `second`. A missing value is None."""
     found = []
     for key in first | second:
         pair = {"key": key, "first": first.get(key), "second": second.get(key)}
@@ -430,12 +386,10 @@ def _joined(values: Iterable[object]) -> str:
 
 
 def split_values(texts: Iterable[object]) -> set[str]:
-    """Split texts at semicolons and return all different values."""
     return set(";".join(map(str, texts)).split(";"))
 
 
 def is_stressed(results: Iterable[Result]) -> bool:
-    """Return whether a study compares several kinds or levels of stress (disturbed worlds, docs/stress.md)."""
     return len(set(map(attrgetter("stress", "stress_level"), results))) > 1
 
 
@@ -449,10 +403,9 @@ _LATENCY_COLUMNS = (
 
 
 def latency_table(results: Sequence[Result]) -> list[Row]:
-    """Return the rows of settings whose world goes on during a decode (`rollout.clock=real`).
+    """Return the rows of settings whose world, as their baseline's, goes on during a decode (`rollout.clock=real`).
 
-    A row is left out if the world of its baseline waits during decodes. The added column `ar_latency_ms` is the mean
-    latency of the baseline's decodes.
+    `ar_latency_ms` is the mean latency of the baseline's decodes.
     """
     felt = {row.label: row.measures.felt_latency_ms for row in results}
     delayed = []

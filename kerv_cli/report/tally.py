@@ -25,10 +25,8 @@ class Tally:
     Attributes:
         nodes: Number of verified draft tokens. In a tree, tokens that are not on the accepted path count, too.
         lengths: Entry k is the number of verifications that accepted k draft tokens.
-        judged: Entry k is the number of verifications that judged k draft tokens. The judged tokens are the accepted
-            tokens and, if a draft token was rejected after them, the first rejected token.
-        reached: (D,) number of judged tokens of each DoF. Verification reached these tokens, because it accepted all
-            tokens before them.
+        judged: Entry k is the number of verifications that judged k: the accepted tokens and the first rejected one.
+        reached: (D,) number of judged tokens of each DoF.
         accepted: (D,) number of accepted tokens of each DoF.
         drift: (D,) sum over these of draft token − target's token, in bins.
     """
@@ -69,7 +67,6 @@ class Tally:
 
     @classmethod
     def of_records(cls, decodes: Iterable[DecodeRecord], dofs: int) -> Tally:
-        """Count the verifications of some decodes. `dofs` is the number of DoFs of an action."""
         numbers: list[tuple[int, int, int, int]] = []
         differences: list[int] = []
         for decode in decodes:
@@ -101,12 +98,11 @@ class Tally:
 
     @property
     def drafts(self) -> int:
-        """Number of verified drafts. Each verification has one draft."""
         return int(self.lengths.sum())
 
     @property
     def by_position(self) -> tuple[np.ndarray, np.ndarray]:
-        """Two arrays: the numbers of reached tokens and the numbers of accepted tokens, by position in the draft."""
+        """The numbers of reached tokens and of accepted tokens, each by position in the draft."""
         reached, accepted = self.judged[::-1].cumsum()[::-1][1:], self.lengths[::-1].cumsum()[::-1][1:]
         return reached, _sum(np.zeros(len(reached), int), accepted)
 
@@ -132,7 +128,7 @@ class Tally:
 
 
 def rates(reached: np.ndarray, accepted: np.ndarray) -> list[float | None]:
-    """Return accepted ÷ reached tokens for each position in the draft, or each DoF. None if no token was reached."""
+    """Return accepted ÷ reached tokens. None if no token was reached."""
     quotients: list[float | None] = (accepted / np.maximum(reached, 1)).tolist()
     for position in np.flatnonzero(reached == 0):
         quotients[position] = None

@@ -1,11 +1,7 @@
 """Decide which setting of a study to take, and write the sentences that say what the study shows.
 
-The setting to take is the fastest setting that is shown to lose little success. The settings of a finished study are
-tested in a fixed order, the safest first. Testing ends at the first setting that fails (fixed-sequence testing). So all
-tests together have the error rate of one test (docs/methods.md §7).
-
-No other module of kerv writes such sentences. A sentence says *faster*, *slower* or *loses less than* only if a 95 %
-interval shows it. If the baseline's success rate is below `SOLVED`, no setting is recommended.
+A sentence says *faster*, *slower* or *loses less than* only if a 95 % interval shows it (docs/methods.md §7). If the
+baseline's success rate is below `SOLVED`, no setting is recommended.
 """
 
 from __future__ import annotations
@@ -28,21 +24,16 @@ POINTS = 100.0
 class Choice:
     """Which setting to take.
 
-    The bound is the largest loss of success that the reader accepts.
-
     Attributes:
-        pairs: Number of pairs of the setting with the most pairs. A pair is one episode of the baseline and one of the
-            setting, from the same initial state.
+        pairs: Number of pairs of the setting with the most pairs.
         baseline_success: Success rate of the baseline.
-        chosen: Fastest setting that is shown to lose less success than the bound. Empty if there is no such
-            setting.
-        candidate: If no setting is chosen, the fastest setting that would be chosen after more pairs, if the rates
-            stay the same. Empty if more pairs would not help, or if a setting is chosen.
+        chosen: Fastest setting that is shown to lose less success than the reader accepts. Empty if there is none.
+        candidate: If no setting is chosen, the fastest that would be after more pairs, at these rates. Empty if there
+            is none.
         candidate_pairs: About how many pairs in all would let the candidate be chosen. NaN without a candidate.
         tested: Number of settings whose loss of success is tested.
         untimed: Settings that are not tested, because others were timed and they were not.
-        episode_speedup: Speed per episode of the chosen setting, or else of the candidate, relative to the baseline.
-            NaN if that setting was not timed.
+        episode_speedup: Speed per episode of the chosen setting, or else of the candidate.
         runs: Number of runs (commands) from which the interval of `episode_speedup` was computed.
     """
 
@@ -58,21 +49,18 @@ class Choice:
 
     @property
     def is_shown(self) -> bool:
-        """Whether a setting is shown both to be faster and to lose less success than the bound."""
+        """Whether a setting is shown both to be faster and to lose less success than the reader accepts."""
         return bool(self.chosen) and self.episode_speedup.low > 1
 
     @property
     def is_unsolved(self) -> bool:
-        """Whether the baseline succeeds too rarely for a recommendation."""
         return self.baseline_success < SOLVED
 
 
 def choose(rows: Sequence[Result], loss: float) -> Choice:
-    """Choose the fastest setting that is shown to lose less success than `loss`.
+    """Choose the fastest setting that is shown to lose less success than `loss`, in points.
 
-    Args:
-        rows: One row per setting, the baseline included.
-        loss: Largest acceptable loss of success against the baseline, in points.
+    Settings are tested in a fixed order, the safest first, until one fails (`passing`).
     """
     success = next((row.measures.success.value for row in rows if row.is_baseline), math.nan)
     pairs = max((row.measures.pairs for row in rows if not row.is_baseline), default=0)
@@ -100,11 +88,10 @@ def choose(rows: Sequence[Result], loss: float) -> Choice:
 
 
 def safest_first(rows: Sequence[Result]) -> list[Result]:
-    """Return the rows of the settings to test, the safest first. Success does not influence the order.
+    """Return the rows of the settings to test, the safest first (`safety`). Equally safe ones keep the study's order.
 
-    A setting is safer if it has fewer unverified tokens, or else more forwards per control step (`safety`). Settings
-    that are equally safe keep the study's order. Settings that are not faster than the baseline are left out, and
-    settings without a measured speed, unless no setting has one: then success alone decides.
+    Settings that are not faster than the baseline are left out. So are settings without a measured speed, unless no
+    setting has one: then success alone decides.
     """
     compared = [row for row in rows if row.is_compared]
     is_timed = any(is_number(row.speed) for row in compared)
@@ -112,12 +99,6 @@ def safest_first(rows: Sequence[Result]) -> list[Result]:
 
 
 def _fastest(rows: Sequence[Result]) -> Result:
-    """Return the row of the fastest of the tested settings.
-
-    A setting whose interval shows that it is faster than the baseline is preferred to any other setting. If no setting
-    has a measured speed, return the setting that was tested last.
-    """
-
     def speed(row: Result) -> tuple[bool, float]:
         found = row.measures.episode_speedup
         return (found.low > 1, found.value) if is_number(found.value) else (False, -math.inf)
@@ -129,10 +110,9 @@ class Verdict(NamedTuple):
     """A study's answer.
 
     Attributes:
-        sentence: The answer as a sentence for the report.
         is_shown: Whether a setting is shown both to be faster and to lose less success than is accepted.
-        episodes: About how many episodes per task would let the sentence name a setting. 0 if the sentence names a
-            setting already, if more episodes would not help, or if more than 10,000 pairs would be needed.
+        episodes: About how many episodes per task would let the sentence name a setting. 0 if it names one already, if
+            more would not help, or if more than 10,000 pairs would be needed.
     """
 
     sentence: str
@@ -141,12 +121,7 @@ class Verdict(NamedTuple):
 
 
 def verdict_of(results: Sequence[Result], loss: float) -> Verdict:
-    """Return a study's answer.
-
-    Args:
-        results: The study's rows over all tasks.
-        loss: Largest acceptable loss of success against the baseline, in points (percentage points).
-    """
+    """Return a study's answer, given its rows over all tasks. `loss` is in points."""
     rows = results
     baselines = {row.baseline for row in rows if row.is_compared}
     if not baselines:
@@ -160,12 +135,6 @@ def verdict_of(results: Sequence[Result], loss: float) -> Verdict:
 
 
 def question(results: Sequence[Result], loss: float) -> str:
-    """Return the question that the study's verdict answers. Empty if nothing is compared.
-
-    Args:
-        results: The study's rows over all tasks.
-        loss: Largest acceptable loss of success, in points.
-    """
     baselines = {row.baseline for row in results if row.is_compared}
     if len(baselines) > 1:
         return "Which settings succeed less or more often than the baseline under the same stress and clock?"
@@ -175,13 +144,6 @@ def question(results: Sequence[Result], loss: float) -> str:
 
 
 def sentence(choice: Choice, loss: float, baseline: str) -> str:
-    """Say in one sentence which setting to take for all tasks, or why no setting is recommended.
-
-    Args:
-        choice: Which setting to take, and the numbers that the sentence reports.
-        loss: Largest acceptable loss of success, in points.
-        baseline: Label of the baseline.
-    """
     if choice.is_unsolved:
         return unsolved(baseline, choice.baseline_success)
     bound = f"loses less than {loss:g} points of success against {baseline}"
@@ -202,9 +164,7 @@ def sentence(choice: Choice, loss: float, baseline: str) -> str:
 
 
 def order_of(by_speed: Sequence[tuple[str, stats.Estimate]]) -> str:
-    """Return the settings as text in the order of their speed per episode, joined by `>`.
-
-    `≈` joins neighbours whose episodes cannot show which is faster. The text explains this sign.
+    """Return the settings as text in the order of their speed per episode. `≈`: not shown which is faster.
 
     Args:
         by_speed: The settings, the fastest first, each with its speed relative to the next slower setting.
@@ -217,12 +177,6 @@ def order_of(by_speed: Sequence[tuple[str, stats.Estimate]]) -> str:
 
 
 def unsolved(baseline: str, success: float) -> str:
-    """Return a sentence that no setting is recommended, because the baseline succeeds too rarely.
-
-    Args:
-        baseline: Label of the baseline.
-        success: Success rate of the baseline, from 0 to 1.
-    """
     return (
         f"{baseline} does not solve these tasks ({100 * success:.0f} % of its episodes succeed), so no setting is "
         "recommended"
@@ -244,10 +198,6 @@ def _factor(choice: Choice) -> str:
 
 
 def _missing(choice: Choice) -> str:
-    """Return a clause on the candidate: about how many more pairs would let the verdict choose that setting.
-
-    If there is no candidate, the clause says that more pairs would not help.
-    """
     if not choice.candidate:
         return "at these rates, more pairs would not show one either"
     more = max(1, math.ceil(choice.candidate_pairs - choice.pairs))
@@ -256,11 +206,6 @@ def _missing(choice: Choice) -> str:
 
 
 def under_conditions(rows: Sequence[Result]) -> str:
-    """Say which settings succeed less or more often than the baseline under the same stress and clock.
-
-    Args:
-        rows: The study's rows, pooled over tasks.
-    """
     method = next(filter(attrgetter("is_baseline"), rows)).method
     less, more = [], []
     failing: dict[str, None] = {}
@@ -282,10 +227,7 @@ def under_conditions(rows: Sequence[Result]) -> str:
 
 
 def caution(results: Sequence[Result]) -> str:
-    """Return one line that the reader should know before the numbers. Empty if there is nothing to say.
-
-    The line names policies that are given the positions of object and goal, and settings that verify nothing.
-    """
+    """Return what the reader should know before the numbers: privileged policies, and settings that verify nothing."""
     privileged, unverified = set(), []
     for row in results:
         if "privileged" in row.observation:

@@ -10,15 +10,7 @@ from kerv_cli.engine.record import EpisodeRecord
 
 
 def save_recording(record: EpisodeRecord, path: Path, method: str) -> Path:
-    """Write an episode as a recording for the Rerun viewer and return the path.
-
-    The file is written atomically. It contains the layout of the viewer.
-
-    Args:
-        record: The episode. Without frames, the recording shows no camera.
-        path: The .rrd file. Its folder is created.
-        method: Name of the method. Recordings of one method share their layout in the viewer.
-    """
+    """Write an episode as a recording for the Rerun viewer. Recordings of one `method` share their layout."""
     if not has_rerun():
         raise KervError(NO_RERUN)
     from kerv_cli.report.viewing.rerun_log import encode

@@ -31,34 +31,21 @@ COLORS = (0xE15759FF, 0x59A14FFF, 0x4E79A7FF, 0xB6992DFF, 0x9D7660FF, 0x86BCB6FF
 _OPEN, _CLOSED = np.array([86.0, 180.0, 233.0]), np.array([230.0, 120.0, 0.0])
 
 Colors = Sequence[int]
+# (rows,) control step of each row
 Steps = NDArray[np.int64]
-"""(rows,) control step of each row."""
 
 
 class _Log:
-    """Writes data to a Rerun recording.
-
-    Attributes:
-        recording: Stream that the data is written to.
-        hz: Control steps per simulated second.
-    """
+    """Writes data to a Rerun recording, by path in the viewer. `hz`: control steps per simulated second."""
 
     def __init__(self, recording: rr.RecordingStream, hz: float) -> None:
         self.recording = recording
         self.hz = hz
 
     def static(self, path: str, archetype: rr.AsComponents) -> None:
-        """Log data that stays the same for the whole episode. `path` is the name of the data in the viewer."""
         self.recording.log(path, archetype, static=True)
 
     def rows(self, path: str, steps: Steps, columns: Iterable[rr.ComponentColumn]) -> None:
-        """Log data over time.
-
-        Args:
-            path: Name of the data in the viewer.
-            steps: (rows,) control step of each row.
-            columns: Rerun columns with one value per row.
-        """
         nanoseconds = np.round(steps * (1e9 / self.hz)).astype("timedelta64[ns]")
         times = [rr.TimeColumn(STEP, sequence=steps), rr.TimeColumn(TIME, duration=nanoseconds)]
         self.recording.send_columns(path, times, columns)
@@ -67,9 +54,7 @@ class _Log:
         """Log a state over time, drawn as a coloured bar. A state lasts until the next one.
 
         Args:
-            path: Name of the bar in the viewer.
             steps: (rows,) control step at which each state begins.
-            values: (rows,) the states.
             looks: Label and colour (0xRRGGBBAA) of each state.
         """
         labels, colors = zip(*looks.values(), strict=True)
@@ -88,12 +73,9 @@ class _Log:
         """Log numbers over time, drawn as step lines.
 
         Args:
-            path: Name of the plot in the viewer.
-            steps: Control step of each row.
             names: Name of each line.
-            values: For each row, a sequence with one number per line, or a single number if there is only one line. A
-                row that is empty or begins with None is left out.
-            colors: Colour of each line (0xRRGGBBAA). The colours repeat if there are more lines than colours.
+            values: For each row, one number per line. A row that is empty or begins with None is left out.
+            colors: Colour of each line (0xRRGGBBAA). They repeat if there are more lines.
         """
         present, numbers = [], []
         for step, value in zip(steps, values, strict=True):
@@ -110,12 +92,6 @@ class _Log:
 
 @catch_and_log_exceptions(strict=True)  # rerun would turn exceptions into warnings and missing views
 def encode(record: EpisodeRecord, method: str) -> bytes:
-    """Return an episode as the bytes of an .rrd file.
-
-    Args:
-        record: The episode. Without frames, the recording shows no camera.
-        method: Name of the method.
-    """
     recording = rr.RecordingStream("kerv_" + _part(method))
     memory = recording.memory_recording()
     recording.set_log_time_enabled(False)
@@ -143,10 +119,6 @@ def encode(record: EpisodeRecord, method: str) -> bytes:
 
 
 def _log_world(log: _Log, record: EpisodeRecord) -> None:
-    """Log the path of the end effector, its position over time, and the positions of object and goal.
-
-    The colour of the position shows how far the gripper is open.
-    """
     steps = np.arange(len(record.path), dtype=np.int64)
     opening = np.clip(record.gripper, 0.0, 1.0)[:, None]
     colors = np.round(_OPEN * opening + _CLOSED * (1 - opening)).astype(np.uint8)
@@ -161,7 +133,6 @@ def _log_world(log: _Log, record: EpisodeRecord) -> None:
 
 
 def _log_tokens(log: _Log, record: EpisodeRecord) -> None:
-    """Log for each decode: its mode, the outcome of each token of its chunk as coloured bars, and a table."""
     starts = np.asarray(record.decode_steps, dtype=np.int64)
     names = outcomes.token_names(record.decodes, record.space.names)
     size = outcomes.chunk_size(record.decodes, len(names))
@@ -196,7 +167,6 @@ def _part(name: str) -> str:
 
 
 def _log_numbers(log: _Log, record: EpisodeRecord) -> None:
-    """Log numbers per control step and per decode. Measures without values are left out."""
     decodes, names = record.decodes, list(record.space.names)
     steps, starts = np.arange(record.steps + 1, dtype=np.int64), np.asarray(record.decode_steps, dtype=np.int64)
     log.numbers("actions", steps[:-1], names, record.actions)
@@ -222,9 +192,9 @@ def _log_numbers(log: _Log, record: EpisodeRecord) -> None:
         log.numbers(f"signals/{signal}", starts, [title], map(attrgetter(signal), decodes))
 
 
-STEP, TIME = "step", "time"
-"""The timelines: control steps, and simulated time."""
+STEP, TIME = "step", "time"  # timelines: control steps, and simulated time
 
+# Optional attributes of DecodeRecord that are plotted -> titles of the plots
 SIGNALS = {
     "variability": "K, kinematic variability",
     "metric": "F, boundary metric",
@@ -232,14 +202,9 @@ SIGNALS = {
     "deviation": "deviation from AR",
     "delay_steps": "latency that the world felt, control steps",
 }
-"""Optional attributes of DecodeRecord that are plotted -> titles of the plots."""
 
 
 def blueprint(record: EpisodeRecord) -> rrb.Blueprint:
-    """Return the viewer's layout: the world and plots, a coloured bar per token, and the current decode.
-
-    Playback is paused at first.
-    """
     path = rrb.Spatial3DView(
         origin="/world", name="End effector: orange closed, blue open gripper", line_grid=rrb.LineGrid3D(spacing=0.1)
     )
@@ -275,12 +240,6 @@ def blueprint(record: EpisodeRecord) -> rrb.Blueprint:
 
 
 def _series(name: str, *entities: str) -> rrb.TimeSeriesView:
-    """Return a view that plots data over time.
-
-    Args:
-        name: Title of the view.
-        *entities: Names under which the data were logged.
-    """
     return rrb.TimeSeriesView(
         origin="/",
         contents=list(map("/{}".format, entities)),

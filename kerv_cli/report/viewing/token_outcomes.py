@@ -17,15 +17,7 @@ from kerv_cli.episodes.identity import hash_of
 
 
 class OutcomeStyle(NamedTuple):
-    """How the viewer shows an outcome.
-
-    The colours are Okabe and Ito's, for colour-blind readers.
-
-    Attributes:
-        symbol: One character that stands for the outcome.
-        color: Colour of the outcome, 0xRRGGBBAA.
-        meaning: What the outcome means, for the legend.
-    """
+    """How the viewer shows an outcome. The colours (0xRRGGBBAA) are Okabe and Ito's, for colour-blind readers."""
 
     symbol: str
     color: int
@@ -48,15 +40,10 @@ OUTCOMES = {
 
 @dataclass(frozen=True)
 class TokenOutcome:
-    """What happened to one token of a chunk.
+    """What happened to one token of a chunk: a key of OUTCOMES, and the tokens at its position, if there were any.
 
     Attributes:
-        kind: A key of OUTCOMES.
-        token: The committed token. None if no token was committed at this position.
-        draft: The drafted token. None if no token was drafted at this position.
-        target: The target's token. None if the target decoded no token at this position.
-        limit: Acceptance threshold r of the token's DoF, in bins. None if the token was not drafted, or if the
-            acceptance rule has no threshold.
+        limit: Acceptance threshold r of the token's DoF, in bins.
     """
 
     kind: str
@@ -88,14 +75,9 @@ def _is_coded(decode: DecodeRecord, dofs: int) -> bool:
 
 
 def chunk_size(decodes: Sequence[DecodeRecord], dofs: int) -> int:
-    """Find N, the number of tokens of a chunk, from an episode's decodes, and return it.
+    """Return N, the number of tokens of a chunk: the most that any decode verified, committed or executed.
 
-    N is the largest number of tokens that any decode verified, committed or executed. It is rounded up to whole control
-    steps.
-
-    Args:
-        decodes: Decodes of the episode.
-        dofs: D, tokens per control step.
+    It is rounded up to whole control steps of `dofs` tokens.
     """
     most = 1
     for decode in decodes:
@@ -108,15 +90,10 @@ def chunk_size(decodes: Sequence[DecodeRecord], dofs: int) -> int:
 
 
 def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome]:
-    """Return the outcome of each token of a decode's chunk.
+    """Return the outcome of each of the N tokens (`size`) of a decode's chunk.
 
     A rejected token stays `rejected` even if a prediction replaced it later. All other tokens that were not executed
     are `dropped`. With FAST tokens, positions after the chunk's end are `ended`.
-
-    Args:
-        decode: The decode.
-        size: N, tokens per chunk.
-        dofs: D, tokens per control step.
     """
     is_coded = _is_coded(decode, dofs)
     executed = len(decode.tokens) if is_coded else len(decode.actions) * dofs
@@ -150,12 +127,7 @@ def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome
 
 
 def acceptance(decodes: Iterable[DecodeRecord]) -> tuple[float, ...]:
-    """Return the acceptance length and the accepted draft tokens per verification (docs/methods.md §7).
-
-    Returns:
-        Two numbers per verification: the mean number of committed tokens, and the mean number of accepted draft tokens.
-        Empty if the decodes have no verification.
-    """
+    """Return the mean committed and accepted tokens per verification (docs/methods.md §7). Empty without one."""
     rounds = itertools.chain.from_iterable(map(attrgetter("rounds"), decodes))
     verifications = list(filter(attrgetter("is_verification"), rounds))
     counts = list(map(attrgetter("committed", "accepted"), verifications))
@@ -174,12 +146,10 @@ def readable(text: str) -> str:
 
 
 def tokens_hash(decodes: Sequence[DecodeRecord]) -> str:
-    """Return a hash of all tokens of an episode, decode by decode."""
     return hash_of([list(one.tokens) for one in decodes])
 
 
 def facts_of(record: EpisodeRecord, method: str) -> dict[str, str | float]:
-    """Return the totals of an episode, which the recording stores as its properties."""
     modes = Counter(map(attrgetter("mode"), record.decodes))
     facts: dict[str, str | float] = {
         "environment": readable(record.environment),
@@ -204,7 +174,6 @@ def facts_of(record: EpisodeRecord, method: str) -> dict[str, str | float]:
 
 
 def summary(record: EpisodeRecord, method: str) -> str:
-    """Return the episode's totals as Markdown, with a legend of the symbols of the tokens."""
     lines = ["| episode |  |", "|:--|:--|"]
     for name, value in facts_of(record, method).items():
         lines.append(f"| {name.replace('_', ' ')} | {f'{value:.4g}' if isinstance(value, float) else value} |")
@@ -224,10 +193,8 @@ def decode_table(
     """Return a decode as Markdown: a line of totals, then a table with one row per token.
 
     Args:
-        decode: The decode.
         number: Number of the decode in the episode, from 0.
         step: Control step at which the decode's first action is executed.
-        outcomes: Outcome of each token of the decode's chunk.
         names: Names of a control step's tokens, from `token_names`.
     """
     is_coded = _is_coded(decode, len(names))

@@ -25,11 +25,11 @@ from kerv_cli.base.files import regular
 if TYPE_CHECKING:
     from rerun.chunk import Chunk, RrdReader
 
+# Recordings that one command opens. More would fill the viewer's memory.
 MOST_OPENED = 16
-"""Largest number of recordings that one command opens. More recordings would fill the viewer's memory."""
 NO_RECORDINGS = "no recordings in {}: make some with 'kerv rollout method=ar task=reach-v3'"
+# Of a film file. A higher number makes the file too large.
 FRAMES_PER_SECOND = 12
-"""Frames per second of a film file. A higher number makes the file too large."""
 _START_SECONDS = 2.0
 
 
@@ -42,11 +42,6 @@ def recordings_below(folder: Path) -> Iterator[Path]:
 
 
 def find_recordings(paths: Iterable[Path]) -> list[Path]:
-    """Return all recordings among some paths, the newest first.
-
-    Args:
-        paths: .rrd files, and folders to search.
-    """
     paths, found = [Path(path).expanduser() for path in paths], set[Path]()
     for path in paths:
         if path.is_dir():
@@ -62,17 +57,13 @@ def find_recordings(paths: Iterable[Path]) -> list[Path]:
 
 
 def has_display() -> bool:
-    """Return whether this machine can open a window."""
     if sys.platform in ("darwin", "win32"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def open_recording(paths: Sequence[Path]) -> str:
-    """Open recordings in the Rerun viewer. Do not wait until the viewer is closed.
-
-    Args:
-        paths: The recordings, the newest first. At most MOST_OPENED are opened.
+    """Open recordings in the Rerun viewer, at most MOST_OPENED. Do not wait until the viewer is closed.
 
     Returns:
         A sentence about what was opened. If this machine has no display, the commands to type on another machine.
@@ -97,12 +88,10 @@ def _own_name(path: Path) -> str:
 
 
 def viewer_command() -> list[str]:
-    """Return the command that starts the viewer installed with this Python."""
     return [sys.executable, "-m", "rerun"]
 
 
 def _start(command: list[str]) -> None:
-    """Start the viewer in a process of its own."""
     with tempfile.TemporaryFile() as log:
         try:
             viewer = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True)
@@ -185,11 +174,10 @@ def _read(path: Path, changed: int) -> Film:
 
 
 def animation(film: Film, slower: float = 1.0) -> bytes:
-    """Return a film as a GIF that plays again and again.
+    """Return a film, which must have frames, as a GIF that plays again and again.
 
     Args:
-        film: The film. It must have frames.
-        slower: How many times slower the film plays than the robot moved. 1 plays in real time.
+        slower: How many times slower the film plays than the robot moved.
     """
     hz = film.hz / slower
     each = max(1, round(hz / FRAMES_PER_SECOND))
