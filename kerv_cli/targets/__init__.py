@@ -29,7 +29,6 @@ class TargetPart(Part):
 
 @TargetPart("compact")
 def compact(*arguments: Any) -> Any:
-    """Load a compact target; see `compact.target.build`."""
     from kerv_cli.targets.compact.target import build
 
     return build(*arguments)
@@ -49,7 +48,6 @@ def _check_grown(*arguments: Any) -> None:
 
 @TargetPart("grown", importer=_grow, check_weights=_check_grown)
 def grown(*arguments: Any) -> Any:
-    """Load a grown target; see `grown.build`."""
     from kerv_cli.targets.grown import build
 
     return build(*arguments)
@@ -69,7 +67,6 @@ def _check_openvla(*arguments: Any) -> None:
 
 @TargetPart("openvla", importer=_import_openvla, check_weights=_check_openvla, images_alone=True)  # reads no state
 def openvla(*arguments: Any) -> Any:
-    """Load an OpenVLA target; see `openvla.target.build`."""
     from kerv_cli.targets.openvla.target import build
 
     return build(*arguments)

@@ -23,10 +23,7 @@ class Cache:
     """The keys and values of all tokens that a trunk has processed, for every layer.
 
     Args:
-        layers: Number of layers.
-        batch: B, number of sequences.
         heads: A, number of heads.
-        capacity: Maximum number of tokens.
         channels: C, channels of a head.
         like: Tensor whose device and number format the cache gets.
         fixed: Whether every forward attends to all slots, and a mask hides the unused ones. All shapes are then fixed,
@@ -52,13 +49,11 @@ class Cache:
         self._copies: tuple[np.ndarray, np.ndarray] | None = None
 
     def copies(self, width: int) -> tuple[np.ndarray, np.ndarray, int]:
-        """Return the memory in which compiled programs keep copies of keys and values.
-
-        The copies are stored in panels. A panel of keys has `width` slots, a panel of values has `width` channels.
+        """Return the memory in which compiled programs keep copies of keys and values, in panels.
 
         Returns:
             The keys (layers, B · A, panels, C, width), the values (layers, B · A, panels, slots, width), and the number
-            of slots, from the first on, that these arrays hold already.
+                of slots, from the first on, that these arrays hold already.
         """
         if self._copies is None:
             layers, _, batch, heads, slots, channels = self.buffer.shape
@@ -69,12 +64,9 @@ class Cache:
         return *self._copies, min(self.copied, self.length)
 
     def compact(self, start: int, slots: Tensor) -> None:
-        """Keep the tokens of an accepted path, and drop the rest of the draft tree.
-
-        The kept tokens move to the slots start, start + 1, …. The cache then ends with the last kept token.
+        """Keep the tokens of an accepted path, and drop the rest of the draft tree. They move to `start`, start + 1, ….
 
         Args:
-            start: The first slot to write.
             slots: (n,) slots of the kept tokens in increasing order, none before `start`.
         """
         n = slots.shape[0]
@@ -82,20 +74,14 @@ class Cache:
         self.length, self.copied = start + n, min(self.copied, start)
 
     def next_slots(self, tokens: int) -> Slots:
-        """Return the slots for the next `tokens` tokens, right after the cached tokens.
-
-        The result is a slice. If the cache has fixed shapes, it is a tensor of indices (tokens,).
-        """
+        """Return the slots of the next tokens: a slice, or indices (tokens,) if the cache has fixed shapes."""
         start, stop = self.length, self.length + tokens
         self.copied = min(self.copied, start)
         return torch.arange(start, stop, device=self.buffer.device) if self.fixed else slice(start, stop)
 
 
-Slots = slice | Tensor | None
-"""Slots of a cache that a forward writes to: a slice, or indices (T,) if the cache has fixed shapes. None if there is
-no cache."""
-Rotation = tuple[Tensor, Tensor]
-"""Cosines and sines of the rotary embedding at the positions of T tokens, see `rotate`."""
+Slots = slice | Tensor | None  # that a forward writes to; indices (T,) if the cache has fixed shapes
+Rotation = tuple[Tensor, Tensor]  # cosines and sines at the positions of T tokens
 
 
 def attend(q: Tensor, k: Tensor, v: Tensor, cache: Tensor | None, slots: Slots, mask: Tensor | None) -> Tensor:
@@ -106,7 +92,6 @@ def attend(q: Tensor, k: Tensor, v: Tensor, cache: Tensor | None, slots: Slots, 
         k: (B, K, T, C) keys of K heads. If K < A, several query heads share a head of keys.
         v: (B, K, T, C) values of K heads.
         cache: (2, B, K, slots, C) keys and values of this layer. None if there are no earlier tokens.
-        slots: Slots of the new tokens. None if there is no cache.
         mask: Result of `attention_mask`. If None, attention is causal.
     """
     causal = mask is None and q.shape[2] > 1
@@ -132,12 +117,10 @@ def attention_mask(seen: Seen, tokens: int, cache: Cache | None, like: Tensor) -
             cached tokens, then the T new tokens. Each new token also attends to all earlier cached tokens. If None,
             attention is causal. A tensor must be on the device of `like`.
         tokens: T, number of new tokens.
-        cache: Cache of earlier tokens. None if there are no earlier tokens.
         like: Tensor whose device and number format the mask gets.
 
     Returns:
-        The mask (T, S + T), where S is the number of cached tokens. For a cache of fixed shapes (T, slots), where slots
-        is the number of all its slots. None if no mask is needed.
+        The mask (T, S + T), or (T, all slots) for a cache of fixed shapes. None if no mask is needed.
     """
     cached, fixed = (cache.length, cache.fixed) if cache is not None else (0, False)
     stop = cached + tokens
@@ -174,26 +157,22 @@ _WARM_UP = 3  # runs before a capture, in which libraries choose kernels and all
 
 
 def bucket(tokens: int) -> int:
-    """Return the number of tokens of the smallest CUDA graph that can process `tokens` tokens.
-
-    This number is a power of two up to 16, and above 16 a multiple of 16.
-    """
+    """Return the size of the smallest CUDA graph for so many tokens: a power of two up to 16, then a multiple of 16."""
     if tokens <= 16:
         return 1 << (tokens - 1).bit_length()
     return -(-tokens // 16) * 16
 
 
+# what a CUDA graph captures: `LayerStack.run_layers`
 Compute = Callable[[Tensor, Tensor, Cache, Tensor, Tensor], Tensor]
-"""Type of the function that a CUDA graph captures. The function is `LayerStack.run_layers`."""
 
 
 class CapturedCache(Cache):
     """A key/value cache of fixed shapes, with CUDA graphs that run a forward through all layers in one launch.
 
-    A graph takes a fixed number of tokens, called its bucket (1, 2, 4, 8, 16, 32, 48, …). A forward of T tokens runs in
-    the smallest bucket that is large enough. The bucket's unused tokens have zeros as input. Their keys and values go
-    to the spare slot, which no other token attends to. The batch size is 1. On a CPU the same computation runs without
-    graphs, for tests.
+    A graph takes a fixed number of tokens, called its bucket. A forward of T tokens runs in the smallest bucket that is
+    large enough. The bucket's unused tokens have zeros as input. Their keys and values go to the spare slot, which no
+    other token attends to. The batch size is 1. On a CPU the same computation runs without graphs, for tests.
 
     Attributes:
         steps: The graphs, by number of tokens. Empty before the first forward on a GPU.
@@ -204,16 +183,12 @@ class CapturedCache(Cache):
         self.steps: dict[int, _Step] = {}
 
     def run(self, compute: Compute, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
-        """Run the layers for T new tokens that follow the cached ones.
+        """Return the last layer's output (1, T, width), which the next forward in the same graph overwrites.
 
         Args:
-            compute: The layers' computation, `LayerStack.run_layers`.
             x: (1, T, width) input of the first layer.
             positions: (T,) rotary positions.
             mask: (T, slots) result of `attention_mask`.
-
-        Returns:
-            Output of the last layer (1, T, width). The next forward in the same graph overwrites it.
         """
         # captured now, in the warm-up: later a capture would count in an episode's time
         if self.buffer.is_cuda and not self.steps:
@@ -225,8 +200,6 @@ class CapturedCache(Cache):
 
 
 class _Step:
-    """A CUDA graph for a fixed number of tokens, with its input buffers."""
-
     def __init__(self, compute: Compute, cache: Cache, size: int, width: int) -> None:
         self.compute, self.cache = compute, cache
         like, slots = cache.buffer, cache.buffer.shape[-2]
@@ -252,7 +225,6 @@ class _Step:
         return self.compute(self.x, self.positions, self.cache, self.index, self.mask)
 
     def run(self, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
-        """Copy the inputs to the graph's buffers and replay the graph. `CapturedCache.run` explains the arguments."""
         tokens, start = x.shape[1], self.cache.length
         self.x.zero_()[:, :tokens].copy_(x)
         self.positions[:tokens].copy_(positions)

@@ -24,21 +24,13 @@ if TYPE_CHECKING:  # torch is imported where weights are read or written: a desc
 
 FORMAT = 2
 WEIGHTS = "model.safetensors"
-FLOAT32, FLOAT16, INT8 = "float32", "float16", "int8"
-"""Number formats of stored weights."""
-SCALE = ".scale"
-"""Suffix of a tensor's name: `<name>.scale` contains the scales of the int8 matrix `<name>`, one per row."""
+FLOAT32, FLOAT16, INT8 = "float32", "float16", "int8"  # number formats of stored weights
+SCALE = ".scale"  # `<name>.scale` contains the scales of the int8 matrix `<name>`, one per row
 
 
 @dataclass(frozen=True)
 class Description:
-    """Fields that every description (`<kind>.json`) of an artifact with weights has.
-
-    Attributes:
-        format: Version of the format, `FORMAT`.
-        kind: Kind of artifact, such as `target`.
-        sha256: Hash of the file of weights.
-    """
+    """Fields of every description (`<kind>.json`) of an artifact. `sha256` is the hash of its file of weights."""
 
     format: int
     kind: str
@@ -53,11 +45,7 @@ class TargetDescription(Description):
         family: Registered family of targets, such as `compact`.
         environment: Name of the environment that the target's demonstrations come from.
         settings: Settings of the family. They always contain `chunk`.
-        actions: Action space.
-        observation: Observation space.
-        cameras: Names of the cameras whose images the target reads.
         words: Vocabulary of instructions.
-        provenance: How the target was made.
         state_range: The 0.1th percentiles, then the 99.9th percentiles, of the demonstrations' states. Each tuple has
             one percentile per number of the state. None if the range was not recorded.
     """
@@ -78,54 +66,37 @@ class TargetDescription(Description):
 
     @property
     def chunk(self) -> int:
-        """H, number of control steps that the target was trained to decode at once."""
         return int(self.settings["chunk"])
 
     @property
     def origin(self) -> Mapping[str, Any]:
         """Identity of the policy whose tokens the target decodes. The key `sha256` holds the hash of its weights.
 
-        Usually the policy is the target itself. A grown target (docs/methods.md §0.2) is an enlarged policy, and
-        decodes the tokens of the original policy. The key `base` then holds the folder of the original policy.
+        A grown target (docs/methods.md §0.2) decodes the tokens of the original policy. Any other decodes its own.
         """
         return self.settings.get("grown") or {"sha256": self.sha256}
 
     @property
     def parallel(self) -> bool:
-        """Whether the target decodes all tokens of a chunk in one forward, and cannot decode them one by one."""
         return bool(self.settings.get("parallel"))
 
     @property
     def tasks(self) -> list[str]:
-        """Tasks and suites that the target was trained on. Empty if unknown."""
         return list(self.provenance.get("settings", {}).get("task") or [])
 
     @property
     def demos(self) -> str:
-        """Name of the demonstrations that the target was trained on. Empty if unknown."""
         return self.provenance.get("settings", {}).get("demos") or ""
 
     def check_world(self, name: str, environment: str, actions: ActionSpace, size: int) -> None:
-        """Check that the target can act in an environment.
-
-        Args:
-            name: Name of the target, for the error message.
-            environment: Name of the environment, for the error message.
-            actions: Action space of the environment.
-            size: Pixels per side of the images that the environment gives.
-        """
+        """Refuse an environment in which the target cannot act. Its images have `size` pixels per side."""
         trained = self.settings.get("image_size", size)
         if self.cameras and size != trained:
             raise UsageError(f"world.camera.size={size}: the policy was trained on {trained} pixels")
         self.actions.check_same(actions, f"target '{name}'", f"environment {environment}")
 
     def check_autoregressive(self, what: str, why: str) -> None:
-        """Check that the target decodes token by token.
-
-        Args:
-            what: The setting that requires decoding token by token, text for the error message.
-            why: Why the setting requires this, text for the error message.
-        """
+        """Refuse a parallel target. `what` needs decoding token by token, because `why`."""
         if self.parallel:
             raise UsageError(f"{what}: the target decodes all tokens at once, {why}; choose one that is autoregressive")
 
@@ -134,25 +105,13 @@ T = TypeVar("T", bound=Description)
 
 
 def save_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
-    """Write a safetensors file atomically.
-
-    Args:
-        path: The file.
-        tensors: The tensors, by name.
-        metadata: Texts to store in the file, by name. None if there are no texts.
-    """
     from safetensors.torch import save
 
     write_bytes(path, save({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, metadata))
 
 
 def load_tensors(path: Path, what: str) -> dict[str, Tensor]:
-    """Return the tensors of a safetensors file.
-
-    Args:
-        path: The file.
-        what: What the file contains, text for the error message.
-    """
+    """Return the tensors of a safetensors file, all finite. `what` names the content in error messages."""
     import torch
     from safetensors import SafetensorError
     from safetensors.torch import load_file
@@ -175,10 +134,9 @@ def compact(state: Mapping[str, Tensor], stored: str) -> dict[str, Tensor]:
     """Convert tensors to the number format in which they are stored.
 
     Args:
-        state: The tensors, by name.
-        stored: Number format. float32 changes nothing. float16 converts all floats. int8 converts matrices to integers
-            from -127 to 127, and all other floats to float16. Each row of a matrix gets a float16 scale in
-            `<name>.scale`: the row's largest absolute value / 127.
+        stored: float32 changes nothing. float16 converts all floats. int8 converts matrices to integers from -127 to
+            127, and all other floats to float16. Each row of a matrix gets a float16 scale in `<name>.scale`: the row's
+            largest absolute value / 127.
     """
     import torch
 
@@ -197,10 +155,7 @@ def compact(state: Mapping[str, Tensor], stored: str) -> dict[str, Tensor]:
 
 
 def expanded(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Convert int8 matrices back to float32. Each row is multiplied by its scale, which `compact` stored.
-
-    The result does not contain the scales. All other tensors stay unchanged.
-    """
+    """Convert the int8 matrices of `compact` back to float32, and leave out their scales."""
     full = {}
     for name, tensor in tensors.items():
         if not (name.endswith(SCALE) and name.removesuffix(SCALE) in tensors):  # a module may have its own `….scale`
@@ -218,9 +173,7 @@ def save_module(
     new pair. Other files in the folder stay.
 
     Args:
-        folder: Folder to write to.
-        kind: Kind of artifact, such as `drafter`.
-        module: Module whose weights are written.
+        kind: Kind of artifact, such as `target`.
         description: Fields of the description besides format, kind and sha256.
         stored: Number format of the stored weights. `load_state` converts them back to float32.
     """
@@ -238,7 +191,6 @@ def save_module(
 
 
 def _linked(source: str, new: str) -> None:
-    """Give a file a second name, or copy it if the file system has no hard links."""
     try:
         os.link(source, new)
     except OSError:
@@ -260,26 +212,14 @@ def target_fields(
 
 
 def read_description(folder: Path, kind: str, schema: type[T]) -> T:
-    """Return the description of an artifact. Check the description's fields and the hash of the weights.
-
-    Args:
-        folder: Folder of the artifact.
-        kind: Kind of artifact, such as `drafter`.
-        schema: Dataclass of the description.
-    """
+    """Return the description of an artifact, after checking its fields and the hash of its weights."""
     description = described(folder, kind, schema)
     check_weights(folder, kind, description.sha256)
     return description
 
 
 def described(folder: Path, kind: str, schema: type[T]) -> T:
-    """Return the description of an artifact without checking its weights.
-
-    Args:
-        folder: Folder of the artifact.
-        kind: Kind of artifact, such as `drafter`.
-        schema: Dataclass of the description.
-    """
+    """Return the description of an artifact without checking its weights."""
     path = folder / f"{kind}.json"
     if not path.is_file():
         raise CheckpointError(f"no {kind} in {folder}: run 'kerv train {kind}', or name a folder that holds one")
@@ -290,13 +230,6 @@ def described(folder: Path, kind: str, schema: type[T]) -> T:
 
 
 def check_weights(folder: Path, kind: str, sha256: str) -> None:
-    """Check that the weights in a folder have the hash that the description gives.
-
-    Args:
-        folder: Folder of the artifact.
-        kind: Kind of artifact, for the error message.
-        sha256: The hash in the description.
-    """
     weights = folder / WEIGHTS
     if not weights.is_file():
         raise CheckpointError(f"{weights} is missing: the {kind} is incomplete, train or copy it again")
@@ -305,13 +238,6 @@ def check_weights(folder: Path, kind: str, sha256: str) -> None:
 
 
 def load_state(module: nn.Module, folder: Path, kind: str) -> None:
-    """Load the weights in a folder into a module.
-
-    Args:
-        module: The module.
-        folder: Folder with `model.safetensors`.
-        kind: Kind of artifact, for the error message.
-    """
     try:
         module.load_state_dict(expanded(load_tensors(folder / WEIGHTS, kind)))
     except RuntimeError as error:
@@ -320,11 +246,7 @@ def load_state(module: nn.Module, folder: Path, kind: str) -> None:
 
 
 def read_target(folder: Path) -> TargetDescription:
-    """Return the description of a target, and check its weights.
-
-    A family of targets whose weights are not in the target's folder registers its own check
-    (`TargetPart.check_weights`).
-    """
+    """Return the description of a target, and check its weights as its family does (`TargetPart.check_weights`)."""
     description = described(folder, "target", TargetDescription)
     family = TargetPart.every().get(description.family)
     if family is not None and family.check_weights is not None:
@@ -335,16 +257,7 @@ def read_target(folder: Path) -> TargetDescription:
 
 
 def load_target(folder: Path, device: str = "cpu", dtype: torch.dtype | None = None) -> tuple[Any, TargetDescription]:
-    """Load a target for inference.
-
-    Args:
-        folder: Folder of the target.
-        device: Device to load the target to.
-        dtype: Number format to convert the weights to. If None, it is float32.
-
-    Returns:
-        The target and its description.
-    """
+    """Load a target for inference. Its weights become float32 if `dtype` is None."""
     import torch
 
     description = read_target(folder)

@@ -21,24 +21,20 @@ from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.protocol import Cache, Target
 from kerv_cli.worlds.findings import Finding, find, need
 
+# largest difference of two logits that rounding can cause, in standard deviations of the logits
 TOLERANCE = {torch.float64: 1e-6, torch.float32: 2e-4, torch.bfloat16: 0.2, torch.float16: 0.05}
-"""Largest difference of two logits that rounding can cause, in standard deviations of the logits, by number format."""
 MEMBERS = ("actions", "chunk", "cameras", "width", "max_prompt", "device")
 METHODS = ("encode", "embed", "new_cache", "forward", "head")
-TREE = Draft.of([0] * 7, [-1, 0, 0, 1, 1, 2, 4])
-"""A draft tree for the checks. Its tokens do not matter, only its shape."""
+TREE = Draft.of([0] * 7, [-1, 0, 0, 1, 1, 2, 4])  # only its shape matters
+# hidden states (…, E): as the engine computes them, and as expected up to rounding
 Pairs = Iterable[tuple[Tensor, Tensor]]
-"""Pairs of hidden states (…, E): first as the engine computes them, then as expected. The logits of both must be equal
-up to rounding."""
 
 
 @torch.inference_mode()
 def check_target(target: Target, observation: Observation) -> list[Finding]:
-    """Run the checks, and return one finding per check. After a failed check that all later checks need, stop.
+    """Return one finding per check.
 
-    Args:
-        target: The target.
-        observation: An observation that the target can encode. Its values do not matter.
+    A failed check that all later ones need is the last. The observation's values do not matter.
     """
     trial, findings = Trial(target, observation), []
     for what, fault, check in CHECKS:
@@ -49,27 +45,19 @@ def check_target(target: Target, observation: Observation) -> list[Finding]:
 
 
 class Trial:
-    """The checks of one target on one observation. A check that fails raises a KervError.
+    """The checks of one target on one observation.
 
-    Most checks compare hidden states with the result of `plain`, which runs one causal forward without a cache.
-
-    Attributes:
-        tokens: Action tokens for the checks. Their values do not matter.
-        drafted: Tokens of the nodes of `TREE`. Their values do not matter either.
+    A check that fails raises a KervError. Most checks compare hidden states with the result of `plain`, which runs one
+    causal forward without a cache.
     """
 
     def __init__(self, target: Target, observation: Observation) -> None:
         self.target, self.observation = target, observation
 
     def compare(self, fault: str, check: Callable[[Trial], Pairs | None]) -> str:
-        """Run a check, which yields pairs of hidden states, and compare the logits within each pair.
+        """Compare the logits within each pair that a check yields.
 
-        Args:
-            fault: What is wrong if the logits differ, text for the error message.
-            check: The check.
-
-        Returns:
-            Text with the largest difference of two logits, in standard deviations of the logits.
+        Differences are in standard deviations of the logits.
         """
         worst = 0.0
         for hidden, expected in check(self) or ():
@@ -81,7 +69,6 @@ class Trial:
         return f"logits within {worst:.1g} of their spread" if worst else "as declared"
 
     def members(self) -> None:
-        """Check that the target has all required attributes and methods."""
         missing = [name for name in (*MEMBERS, *METHODS) if not hasattr(self.target, name)]
         need(not missing, f"{type(self.target).__name__} lacks {', '.join(missing)} (kerv_cli/engine/protocol.py)")
         need(not isinstance(self.target.cameras, str), "cameras is a text, must be a tuple of names")
@@ -90,7 +77,6 @@ class Trial:
         self.drafted = ((17 * np.arange(len(TREE)) + 5) % count).tolist()
 
     def encode(self) -> None:
-        """Check that a prompt has the right shape and finite numbers, and is the same in a second encoding."""
         prompt, width, longest = self.target.encode(self.observation), self.target.width, self.target.max_prompt
         right = prompt.ndim == 3 and len(prompt) == 1 and prompt.shape[2] == width
         need(right, f"encode gives {tuple(prompt.shape)}, must be (1, P, {width})")
@@ -101,7 +87,6 @@ class Trial:
         need(same, "the same observation gives another prompt the second time: a module is in training mode?")
 
     def embed_and_head(self) -> None:
-        """Check the shapes and number formats that `embed`, `forward` and `head` return."""
         width, count, dtype = self.target.width, self.target.actions.tokens, self.prompt.dtype
         embedded = self.embed([0, count - 1])
         right = embedded.shape == (1, 2, width) and embedded.dtype == dtype
@@ -113,40 +98,29 @@ class Trial:
         need(right, f"head gives {tuple(logits.shape)}, finite (1, T, {count}) are wanted")
 
     def embed(self, tokens: Sequence[int]) -> Tensor:
-        """Return the embeddings (1, T, E) of tokens."""
         return self.target.embed(torch.tensor([tokens], device=self.prompt.device))
 
     def with_prompt(self, tokens: Sequence[int]) -> Tensor:
-        """Return the prompt followed by the embeddings of tokens, (1, P + T, E)."""
         return torch.cat([self.prompt, self.embed(tokens)], 1) if tokens else self.prompt
 
     def new_cache(self, batch: int = 1) -> Cache:
-        """Return an empty cache with room for everything that the checks forward."""
         return self.target.new_cache(batch, self.length + len(self.tokens) + len(TREE))
 
     def append(self, x: Tensor, cache: Cache | None = None) -> Tensor:
-        """Forward embeddings (B, T, E) causally, after the cached tokens. Return their hidden states (B, T, E)."""
+        """Return the hidden states (B, T, E) of embeddings (B, T, E), forwarded causally after the cached tokens."""
         first = cache.length if cache is not None else 0
         return self.target.forward(x, torch.arange(first, first + x.shape[1], device=x.device), cache)
 
     def plain(self, tokens: Sequence[int]) -> Tensor:
-        """Return the hidden states (1, P + T, E) of the prompt and T tokens, from one forward without a cache."""
         return self.append(self.with_prompt(tokens))
 
     def path(self, node: int) -> list[int]:
-        """Return the tokens of the draft tree from its root to a node."""
         return [self.drafted[i] for i in TREE.tree.path_to(node)]
 
     def causality(self) -> Pairs:
-        """Check that a token's hidden state does not depend on later tokens.
-
-        Yields the hidden states of the prompt and four tokens: from a forward without later tokens, and from a forward
-        of all tokens.
-        """
         yield self.plain(self.tokens[:4]), self.plain(self.tokens)[:, : self.length + 4]
 
     def pieces(self) -> Pairs:
-        """Check that several forwards with a cache give tokens the same hidden states as one without a cache."""
         for lengths in ([1] * 6, [1, 5, 3]):
             cache, rest = self.new_cache(), iter(self.tokens)
             self.append(self.prompt, cache)
@@ -155,10 +129,9 @@ class Trial:
             yield torch.cat(hidden, 1), self.plain(self.tokens[:count])[:, -count:]
 
     def forward_tree(self) -> tuple[Cache, Tensor]:
-        """Run two forwards: the prompt and two tokens, then a third token and the draft tree after it.
+        """Forward the prompt and two tokens, then a third token and the draft tree of n nodes after it.
 
-        Returns:
-            The cache, and the hidden states (1, 1 + n, E) of the third token and the tree's n nodes.
+        Return the cache, and the hidden states (1, 1 + n, E) of the second forward.
         """
         cache = self.new_cache()
         self.append(self.with_prompt(self.tokens[:2]), cache)
@@ -166,11 +139,10 @@ class Trial:
         return cache, self.target.forward(x, positions, cache, TREE.visible(1))
 
     def draft_tree(self) -> Pairs:
-        """Check that forwarding a draft tree gives each node the same hidden state as forwarding only the node's path.
+        """Compare each node's hidden state in the tree with a forward of only the node's path.
 
-        The whole tree is forwarded twice. First it follows cached tokens, as in a later round of a decode. Then it
-        follows the prompt in one forward, as when the prefill verifies a draft. Yields two pairs per node, one for each
-        case: the node's hidden state in the tree, and in a forward of only the node's path.
+        The tree first follows cached tokens, as in a later round of a decode, then the prompt in one forward, as in a
+        prefill that verifies a draft.
         """
         after = self.forward_tree()[1][:, 1:]
         positions, cache = TREE.positions(0, self.length, self.prompt.device), self.new_cache()
@@ -181,7 +153,6 @@ class Trial:
             yield inside[:, node], self.plain(self.path(node))[:, -1]
 
     def commit(self) -> Pairs:
-        """Check that decoding can continue after the cache has kept only the accepted path of a tree."""
         (cache, _), start = self.forward_tree(), self.length + 2
         kept = [start, *(start + 1 + node for node in TREE.tree.path_to(6))]
         cache.compact(start, torch.tensor(kept, device=self.prompt.device))
@@ -190,19 +161,18 @@ class Trial:
         yield self.append(self.embed([last]), cache), self.plain([*self.tokens[:3], *self.path(6), last])[:, -1:]
 
     def reused_cache(self) -> Pairs:
-        """Check that a cache's old content has no effect after its length is set to 0."""
         cache = self.new_cache()
         self.append(self.with_prompt(self.tokens), cache)
         cache.length = 0
         yield self.append(self.prompt, cache), self.plain([])
 
     def batch(self) -> Pairs:
-        """Check that two prompts in one batch give the same hidden states as each prompt alone."""
         prompts = torch.cat([self.prompt, self.prompt.flip(1)])
         for row, prompt in zip(self.append(prompts, self.new_cache(2)), prompts, strict=True):
             yield row[None], self.append(prompt[None])
 
 
+# name, what is wrong if it fails, function; a check without the text is needed by all later ones
 CHECKS: tuple[tuple[str, str, Callable[[Trial], Pairs | None]], ...] = (
     ("members", "", Trial.members),
     ("encode", "", Trial.encode),
@@ -214,7 +184,3 @@ CHECKS: tuple[tuple[str, str, Callable[[Trial], Pairs | None]], ...] = (
     ("cache used again", "a reused cache", Trial.reused_cache),
     ("batch", "a batch of two", Trial.batch),
 )
-"""The checks in order. Each has a name, a text that says what is wrong if it fails, and a function.
-
-If the text is empty, all later checks need this check, and its failure ends the checks.
-"""

@@ -32,30 +32,21 @@ from kerv_cli.targets.compact.target import build as build_compact
 from kerv_cli.targets.compact.trunk import Layer, LayerStack, Rotary
 from kerv_cli.targets.settings import BuildTargetSettings, GrowSettings
 
-STD = 0.02
-"""Standard deviation of the additional weights."""
+STD = 0.02  # standard deviation of the additional weights
 
 
 @dataclass
 class Recipe(GrowSettings):
-    """The recipe in a grown target's folder: the shape of the new trunk, and the target that is enlarged.
-
-    Attributes:
-        base: Folder of the target that is enlarged.
-        sha256: Hash of that target's weights.
-    """
+    """The recipe of a grown target: the shape of the new trunk, and the folder and hash of the target that grows."""
 
     base: str = ""
     sha256: str = ""
 
 
 def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
-    """Replace the layers of a stack by more and larger layers. The stack still computes the same function.
+    """Replace the layers of a trunk or a drafter by more and larger ones, in place.
 
-    Args:
-        stack: A trunk or a drafter. It is changed in place.
-        shape: Width, heads and hidden units of the new layers.
-        layers: Number of new layers.
+    It still computes the same function.
     """
     old: list[Any] = [copy.deepcopy(layer).float() for layer in stack.layers]
     stack.compiled = None
@@ -77,7 +68,7 @@ def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
 
 
 def _grown_layer(old: Layer | None, stack: LayerStack, shape: GrowSettings, generator: torch.Generator) -> Layer:
-    """Make a layer of the new shape with the same output as `old`. If `old` is None, the output equals the input."""
+    # the output equals that of `old`, or the input if `old` is None
     new = Layer(shape.width, shape.heads, shape.feed_forward)
     width, channels, wide = stack.width, stack.width // stack.heads, shape.width // shape.heads
     with torch.no_grad():
@@ -110,26 +101,17 @@ def _grown_layer(old: Layer | None, stack: LayerStack, shape: GrowSettings, gene
 
 
 def recipe_of(description: TargetDescription) -> Recipe:
-    """Return the recipe in a grown target's description."""
     return read(Recipe, description.settings.get("grown", {}), "a grown target's recipe")
 
 
 def check_weights(folder: Path, description: TargetDescription) -> None:
-    """Check that the weights of the original policy, which a grown target enlarges, have not changed."""
     recipe = recipe_of(description)
     if checkpoint.read_target(Path(recipe.base)).sha256 != recipe.sha256:
         raise CheckpointError(f"{folder} grows from {recipe.base}, whose weights are others now: build it again")
 
 
 def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> CompactTarget:
-    """Load the policy that the recipe names, and enlarge its trunk.
-
-    Args:
-        folder: Folder of the grown target.
-        description: The content of its `target.json`, which holds the recipe.
-        device: Device to load the target to.
-        dtype: Number format to convert the weights to.
-    """
+    """Load the policy that the recipe in a grown target's description names, and enlarge its trunk."""
     recipe = recipe_of(description)
     base = Path(recipe.base)
     target = build_compact(base, checkpoint.read_target(base), device, dtype)
@@ -155,11 +137,7 @@ def _grow(target: CompactTarget, shape: GrowSettings) -> None:
 
 
 def grow(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
-    """Make a grown target by writing its recipe, for `kerv build target grow=SHAPE policy.target=NAME`.
-
-    Returns:
-        The target's folder, and numbers to print, each with its name, such as the number of weights.
-    """
+    """Make a grown target by writing its recipe. Return its folder, and numbers to print by name."""
     base = find_target(settings.results, settings.base).resolve()
     description = checkpoint.read_target(base)
     if description.family != "compact":

@@ -13,12 +13,9 @@ from kerv_cli.base.spaces import ActionSpace
 
 
 def soft_labels(tokens: int, sigma: float) -> Tensor:
-    """Return the probabilities (V, V) that a model should predict. Row i is for the case that token i is true.
-
-    A row holds the probabilities of all V tokens: a Gaussian around the true token.
+    """Return the probabilities (V, V) that a model should predict: row i is a Gaussian around the true token i.
 
     Args:
-        tokens: V, number of tokens.
         sigma: Standard deviation in bins. If 0, the true token has the probability 1.
     """
     bins = torch.arange(tokens, dtype=torch.float32)
@@ -28,10 +25,7 @@ def soft_labels(tokens: int, sigma: float) -> Tensor:
 
 
 def labels_of(actions: ActionSpace, sigma: float) -> Tensor:
-    """Return `soft_labels` for the tokens of an action space.
-
-    FAST tokens have no distance to each other. So the true token has the probability 1, whatever `sigma` is.
-    """
+    """Return `soft_labels` for an action space. `sigma` has no effect on FAST tokens, which have no distances."""
     return soft_labels(actions.tokens, sigma if actions.code is None else 0.0)
 
 
@@ -49,21 +43,11 @@ def token_loss(logits: Tensor, tokens: Tensor, labels: Tensor, counted: Tensor |
 
 
 def within_chunk(tokens: Tensor, end: int | None) -> Tensor:
-    """Return a mask (B, N) bool: whether each token belongs to its chunk. Tokens after the end token do not.
-
-    Args:
-        tokens: (B, N) tokens.
-        end: The token that ends a chunk. It belongs to the chunk itself. If None, all tokens belong to their chunk.
-    """
+    """Return whether each of the tokens (B, N) belongs to its chunk. The token `end` does, those after it do not."""
     ends = tokens == (-1 if end is None else end)
     return ends.cumsum(1) - ends.long() == 0
 
 
 def position_loss(estimated: Tensor, places: Tensor) -> Tensor:
-    """Return half the smooth L1 loss of K estimated 3D positions. Errors are measured in units of 2 cm.
-
-    Args:
-        estimated: (B, K, 3) estimated positions in metres.
-        places: (B, K, 3) true positions in metres.
-    """
+    """Return half the smooth L1 loss of 3D positions (B, K, 3) in metres. Errors are measured in units of 2 cm."""
     return F.smooth_l1_loss(estimated / 0.02, places / 0.02, beta=1.0) * 0.5

@@ -24,27 +24,24 @@ from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.worlds import instruction_of
 from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames
 
-BATCH = 64
-"""Number of observations that a target encodes and decodes at once."""
+BATCH = 64  # observations that a target encodes and decodes at once
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Base class of dataclasses whose fields have one row per sample.
+    """Base class of dataclasses whose fields (tensors, encoded images) have one row per sample.
 
-    A field is a tensor or encoded images. The field of the images is None if the samples have no images.
+    Without images, their field is None.
     """
 
     def __len__(self) -> int:
         return next(len(x) for x in vars(self).values() if x is not None)
 
     def where(self, chosen: Tensor) -> Self:
-        """Return the rows that `chosen` selects: a boolean mask (n,), or indices of rows."""
         return type(self)(*(None if x is None else x[chosen] for x in vars(self).values()))
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
-        """Return the rows of all `parts`, one after the other."""
         joined: list[Any] = []
         for column in zip(*(vars(part).values() for part in parts), strict=True):
             if isinstance(column[0], EncodedFrames):
@@ -60,7 +57,7 @@ class Observations(Rows):
 
     Attributes:
         frames: (n, size, size x views, 3) uint8 images. None if the policy reads the state.
-        proprioception: (n, p) float32, the robot's own measurements.
+        proprioception: (n, p) float32.
         states: (n, s) float32, the simulator's privileged state.
         words: (n, L) int64, ids of the instruction's words.
         steps: (n,) int64, control steps since the start of the episode.
@@ -73,7 +70,6 @@ class Observations(Rows):
     steps: Tensor
 
     def inputs(self, device: torch.device) -> Inputs:
-        """Return the observations as a batch on a device, with decoded images."""
         images = None
         if self.frames is not None:
             images = torch.from_numpy(self.frames.pixels()).to(device).permute(0, 3, 1, 2)
@@ -90,12 +86,8 @@ def read_observations(
     """Return the observations of an episode, to train a compact policy.
 
     Args:
-        episode: A stored episode.
-        settings: Shapes of the policy. If the policy reads images, only control steps with an image are observations.
-            Otherwise every control step is one.
-        space: Observation space of the demonstrations.
-        words: The policy's vocabulary.
-        chosen: Which of these observations to return, as indices among them or as a slice.
+        chosen: Which observations to return. If the policy reads images, they are the control steps with an image, else
+            all.
     """
     sees, frames = settings.observation == "vision", None
     steps = observed_steps(episode, sees)[chosen]
@@ -110,42 +102,26 @@ def read_observations(
 
 
 def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarray:
-    """Return the expert's next H actions at each of several control steps, without added noise.
-
-    A chunk that begins near the episode's end includes actions that were recorded after the last control step.
+    """Return the expert's next H actions (n, H, D) at n control steps, in environment units without noise.
 
     Args:
-        episode: A stored episode.
-        steps: (n,) control steps at which the chunks begin.
+        steps: (n,) control steps at which the chunks begin. Near the end, chunks include the actions recorded after it.
         chunk: H, control steps per chunk.
-
-    Returns:
-        (n, H, D) float32, environment units.
     """
     check_tail(episode, chunk, f"chunks of {chunk}")
     return episode.labels[steps[:, None] + np.arange(chunk)]
 
 
 def observed_steps(episode: DemoEpisode, sees: bool) -> np.ndarray:
-    """Return the control steps (n,) that a policy can be trained on.
-
-    Args:
-        episode: The demonstration.
-        sees: Whether the policy reads images. Then only steps with a recorded image count.
-    """
     return episode.frame_steps if sees else np.arange(episode.steps)
 
 
 def observations_of(
     target: Target, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace
 ) -> list[Observation]:
-    """Return what a target would have observed at the control steps `steps` of a demonstration.
+    """Return what a target would have observed at the control steps (n,) of a demonstration.
 
-    Args:
-        target: The target. Each of its cameras gets the recorded image.
-        episode: The demonstration.
-        steps: (n,) control steps.
-        space: Observation space of the demonstrations.
+    Each of its cameras gets the recorded image.
     """
     frames: Any = [None] * len(steps)
     if target.cameras:
@@ -163,16 +139,7 @@ def observations_of(
 
 
 def prompts_of(target: Target, observations: Iterable[Observation], size: int = BATCH) -> Iterator[Tensor]:
-    """Encode observations as prompts, in order.
-
-    Args:
-        target: The target.
-        observations: The observations.
-        size: Maximum number of observations in a batch.
-
-    Yields:
-        Batches of prompts (B, P, E). All prompts of a batch have the same length.
-    """
+    """Encode observations, and yield batches of up to `size` prompts (B, P, E) of equal length, in order."""
     remaining = iter(observations)
     while batch := list(itertools.islice(remaining, size)):
         if isinstance(target, EncodesMany):
@@ -183,13 +150,7 @@ def prompts_of(target: Target, observations: Iterable[Observation], size: int = 
 
 
 def check_tail(episode: DemoEpisode, steps: int, use: str) -> None:
-    """Check that enough actions were recorded for a chunk that begins at the last control step of an episode.
-
-    Args:
-        episode: The episode.
-        steps: Number of expert actions that are needed from the last control step on.
-        use: What the actions are needed for, text for the error message.
-    """
+    """Check that `steps` expert actions were recorded from the last control step on. `use` says what needs them."""
     tail = len(episode.labels) - episode.steps
     if tail < steps - 1:
         raise CheckpointError(
@@ -199,12 +160,7 @@ def check_tail(episode: DemoEpisode, steps: int, use: str) -> None:
 
 
 def check_frames(episode: DemoEpisode, size: int) -> None:
-    """Check that an episode's images have the size that a policy takes.
-
-    Args:
-        episode: The episode.
-        size: Pixels per side of a camera view. An image may consist of several views side by side.
-    """
+    """Check that each view in an episode's images has `size` pixels per side."""
     height, width = episode.frames.shape[1:3]
     if height != size or width % size:
         raise CheckpointError(

@@ -17,35 +17,22 @@ _HERE = Path(__file__).resolve().parent
 
 
 def provenance(device: str) -> dict[str, Any]:
-    """Return versions, commit and device, to be stored in an artifact.
-
-    Args:
-        device: Device of torch, such as `cpu` or `cuda:0`.
-    """
     return {"versions": versions(), "git_commit": git_commit(), "device": device, "device_name": device_name(device)}
 
 
 def provenance_of(command: str, settings: Any, device: str, **figures: Any) -> dict[str, Any]:
-    """Return the whole provenance of an artifact: command, settings, numbers, versions, commit and device.
-
-    Args:
-        command: Name of the command that makes the artifact.
-        settings: Dataclass of the command's settings.
-        device: Device of torch, such as `cpu` or `cuda:0`.
-        **figures: Numbers to store in the provenance, such as the number of parameters.
-    """
+    """Return the whole provenance of an artifact: command, settings, figures, versions, commit and device."""
     return {"command": command, "settings": asdict(settings), **figures, **provenance(device)}
 
 
 def stamp(device: str) -> dict[str, str]:
-    """Return host, device, versions and commit as strings. The keys are columns of the table of episodes."""
+    """Return host, device, versions and commit, by the columns of the table of episodes."""
     numbers = {f"{name}_version": number for name, number in versions().items()}
     return {"host": socket.gethostname(), "device_name": device_name(device), **numbers, "git_commit": git_commit()}
 
 
 @functools.cache
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages in PACKAGES, by name. `absent` means not installed."""
     return {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}}
 
 
@@ -73,10 +60,9 @@ def device_name(device: str) -> str:
 
 @functools.cache
 def git_commit(folder: Path = _HERE) -> str:
-    """Return the hash of kerv's git commit, followed by `+changes` if any tracked file in the checkout was modified.
+    """Return kerv's commit, with `+changes` if a tracked file was modified.
 
-    Args:
-        folder: A folder of kerv's source code. If the folder is not part of a checkout, the result is `none`.
+    `none` if the folder is in no checkout of kerv.
     """
     if shutil.which("git") is None or not _git(folder, "ls-files", "--error-unmatch", "__init__.py"):
         return "none"  # an installed copy may be inside another project's repository

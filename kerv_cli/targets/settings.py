@@ -32,11 +32,6 @@ class TargetSettings:
     parallel: bool = setting(False, "decode all tokens of a chunk at once (docs/methods.md §6)")
 
     def check_together(self, prefix: str) -> None:
-        """Check settings that depend on each other.
-
-        Args:
-            prefix: Start of the settings' names in error messages, such as `target.`.
-        """
         if self.parallel and self.code != "bins":
             raise UsageError(f"{prefix}parallel=true: chunks of {prefix}code={self.code} differ in length; use bins")
         if self.width % (2 * self.heads):

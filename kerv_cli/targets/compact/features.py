@@ -35,7 +35,6 @@ STEP = 0.01  # metres (or units of the state) per control step: velocities are d
 
 
 def mlp(*widths: int) -> nn.Sequential:
-    """Return linear layers from each width to the next, with SiLU between them."""
     parts: list[nn.Module] = []
     for inputs, outputs in itertools.pairwise(widths):
         parts += [nn.Linear(inputs, outputs), nn.SiLU()]
@@ -43,34 +42,21 @@ def mlp(*widths: int) -> nn.Sequential:
 
 
 def relative(vector: Tensor) -> Tensor:
-    """Return the features (…, 6) of vectors (…, 3) in metres.
-
-    The first three features are vector / 0.1 m, the last three tanh(vector / 0.02 m).
-    """
+    """Return features (…, 6) of vectors (…, 3) in metres: vector / 0.1 m, then tanh(vector / 0.02 m)."""
     return torch.cat([vector / COARSE, torch.tanh(vector / FINE)], -1)
 
 
 def hand_features(proprioception: Tensor, centre: Tensor) -> Tensor:
-    """Return the proprioception (B, p), with the end effector's position replaced by (position − centre) / 0.1 m.
-
-    Args:
-        proprioception: (B, p), its first three numbers are the end effector's position in metres.
-        centre: (3,) middle of the workspace in metres.
-    """
+    """Return the proprioception (B, p), with the position in it replaced by (position − centre) / 0.1 m."""
     return torch.cat([(proprioception[:, :3] - centre) / COARSE, proprioception[:, 3:]], -1)
 
 
 def scene_features(proprioception: Tensor, places: Tensor, centre: Tensor) -> Tensor:
-    """Return the scene features (B, p + 15 K − 6).
+    """Return the scene features (B, p + 15 K − 6) of K places (B, K, 3) in metres.
 
-    They hold `hand_features` (p numbers), the K places relative to the centre, divided by 0.1 m (3 K numbers), and
-    2 K − 1 vectors: from the hand to each place, and from each place to the next. `relative` turns each vector into 6
+    They hold `hand_features` (p numbers), the K places relative to the centre, divided by 0.1 m (3 K numbers), and 2 K
+    − 1 vectors: from the hand to each place, and from each place to the next. `relative` turns each vector into 6
     numbers.
-
-    Args:
-        proprioception: (B, p).
-        places: (B, K, 3) positions of the task's places (object, goal, …) in metres.
-        centre: (3,) middle of the workspace in metres.
     """
     vectors = torch.cat([places - proprioception[:, None, :3], places[:, 1:] - places[:, :-1]], 1)
     positions = ((places - centre) / COARSE).flatten(1)
@@ -78,21 +64,15 @@ def scene_features(proprioception: Tensor, places: Tensor, centre: Tensor) -> Te
 
 
 def scene_width(space: ObservationSpace) -> int:
-    """Return the number of columns of `scene_features`."""
     return len(space.proprioception) + 15 * len(space.places) - 6
 
 
 def privileged_features(proprioception: Tensor, states: Tensor, space: ObservationSpace) -> Tensor:
-    """Return features (B, `privileged_width`) for a policy that reads the simulator's state.
+    """Return features (B, `privileged_width`) for a policy that reads the simulator's states (B, s).
 
     They hold the state's extra numbers, its velocities (the change in a control step / 0.01, clamped to ±3), and two
     vectors for each extra place: from the hand to the extra place, and from the extra place to the last of
     `space.places`. `relative` turns each vector into 6 numbers.
-
-    Args:
-        proprioception: (B, p).
-        states: (B, s) privileged states.
-        space: Observation space. It says where a state holds extra numbers, the previous state and extra places.
     """
     hand, last = proprioception[:, :3], position(states, space.places[-1])
     parts = [states[:, list(space.extra)]]
@@ -107,17 +87,15 @@ def privileged_features(proprioception: Tensor, states: Tensor, space: Observati
 
 
 def privileged_width(space: ObservationSpace) -> int:
-    """Return the number of columns of `privileged_features`."""
     return len(space.extra) + (space.previous[0] if space.previous else 0) + 12 * len(space.extra_places)
 
 
 def position(states: Tensor, place: Place) -> Tensor:
-    """Return the 3D position (B, 3) of a place, such as the object, in metres. It is read from states (B, s)."""
     return states[:, place.first : place.first + 3]
 
 
 def places_of(states: Tensor, space: ObservationSpace) -> Tensor:
-    """Return the 3D positions (B, K, 3) of `space.places`, such as object and goal, in metres, from states (B, s)."""
+    """Return the positions (B, K, 3) of `space.places` in metres."""
     return torch.stack([position(states, place) for place in space.places], 1)
 
 
@@ -136,17 +114,14 @@ class WordTokenizer:
 
     @classmethod
     def build(cls, sentences: Iterable[str]) -> WordTokenizer:
-        """Return a tokenizer that knows all words of the sentences, in lower case and in alphabetical order."""
         return cls(tuple(sorted({word for s in sentences for word in s.lower().split()})))
 
     @property
     def size(self) -> int:
-        """Number of ids: one per word, one for padding, and one for unknown words."""
         return len(self.words) + 2
 
     @cached_property
     def index(self) -> dict[str, int]:
-        """Map from a word to its id."""
         return {word: i + 2 for i, word in enumerate(self.words)}
 
     def encode(self, sentence: str, length: int) -> list[int]:
@@ -160,10 +135,8 @@ class WordTokenizer:
 class Residual(nn.Module):
     """Residual block: a norm and two 3 × 3 convolutions.
 
-    Args:
-        channels: C, number of channels.
-        norm: `group` normalises eight groups of channels. `instance` normalises each channel by itself, which makes the
-            output least sensitive to light and colour. Both norms have weights of the same shapes.
+    The norm is `group` (eight groups of channels) or `instance` (each channel by itself), which makes the output least
+    sensitive to light and colour. Both norms have weights of the same shapes.
     """
 
     def __init__(self, channels: int, norm: str = "group") -> None:
@@ -173,7 +146,6 @@ class Residual(nn.Module):
         self.second = nn.Conv2d(channels, channels, 3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return the block's output (B, C, h, w) for x (B, C, h, w)."""
         return x + self.second(F.relu(self.first(self.norm(x))))
 
 
@@ -181,12 +153,9 @@ class VisionEncoder(Compilable):
     """The vision encoder of one camera view (docs/methods.md §0.1).
 
     Args:
-        size: Pixels per side of the image.
         grid: Vision tokens per side.
         keypoints: K, number of image points.
         channels: Channels of the first stage. The second stage has twice as many, the third four times as many.
-        width: E, width of a vision token.
-        norm: Norm of the residual blocks, `group` or `instance`.
     """
 
     columns: Tensor
@@ -207,7 +176,6 @@ class VisionEncoder(Compilable):
         self.register_buffer("columns", torch.linspace(-1, 1, size // 2), persistent=False)
 
     def new_program(self) -> Callable[[Tensor], list[Tensor]] | None:
-        """Return this encoder as a function of one image, in ONNX Runtime. None if the weights are not float32."""
         return compiled_encoder(self, 2 * len(self.columns)) if self.columns.dtype == torch.float32 else None
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -228,11 +196,7 @@ class VisionEncoder(Compilable):
         return tokens, self.points(heat)
 
     def points(self, heat: Tensor) -> Tensor:
-        """Return the image points of K heat maps (B, K, h, w): the expected column and row under each map's softmax.
-
-        Returns:
-            (B, 2K) in [-1, 1]: all columns, then all rows.
-        """
+        """Return image points (B, 2K) in [-1, 1]: the expected column of each heat map (B, K, h, w), then each row."""
         batch, keypoints, height, width = heat.shape
         scaled = heat.float() * self.temperature[:, None, None].float()
         weight = scaled.flatten(2).softmax(-1).view(batch, keypoints, height, width)
@@ -244,16 +208,12 @@ class VisionEncoder(Compilable):
 def compiled_encoder(encoder: nn.Module, size: int) -> Callable[[Tensor], list[Tensor]]:
     """Return a function that runs a vision encoder on one image in ONNX Runtime, which is faster on a CPU than torch.
 
-    torch calls oneDNN for each convolution, and each call takes 19 µs before it computes anything. The encoder of the
-    smallest drafter has eleven convolutions. Measured on an AMD EPYC, 96 × 96 pixels, 8 channels: 607 µs in torch,
-    270 µs in ONNX Runtime. ONNX Runtime uses as many threads as torch has at the time of this call.
+    torch calls oneDNN for each convolution, and each call takes 19 µs before it computes anything. The smallest
+    drafter's encoder has eleven. Measured on an AMD EPYC, 96 × 96 pixels, 8 channels: 607 µs in torch, 270 µs in ONNX
+    Runtime, which uses as many threads as torch has at the time of this call.
 
     Args:
         encoder: Maps images (1, 3, size, size) uint8 to vision tokens (1, grid², E) and K image points (1, 2K).
-        size: Pixels per side of an image.
-
-    Returns:
-        A function that maps such an image to a list of the two outputs of `encoder`.
     """
     import onnxruntime  # needed only on a CPU
 

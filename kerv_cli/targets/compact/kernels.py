@@ -34,10 +34,10 @@ from kerv_cli.targets.compact import recording as op
 from kerv_cli.targets.compact.recording import BFLOAT, FLOAT, HALF, INT8, PANEL
 
 FEATURES = (numba.config.CPU_FEATURES or get_host_cpu_features()).split(",")
+# whether the CPU converts float16 to float32 in registers; if not, float16 weights are stored as float32
 EXPANDS_HALF = "+f16c" in FEATURES or platform.machine() in ("aarch64", "arm64")
-"""Whether the CPU can convert float16 to float32 in registers. If not, float16 weights are stored as float32."""
+# outputs computed at once for two to six rows; all sums must fit into the vector registers
 LANES = PANEL if "+avx512f" in FEATURES else 16
-"""Number of outputs that are computed at once for two to six rows. All sums must fit into the vector registers."""
 FAST = {"contract", "reassoc", "nsz"}
 compiled = numba.njit(error_model="numpy", fastmath=FAST)
 NUMBER, WORD, LANE, VOID, ADDRESS = ir.FloatType(), ir.IntType(64), ir.IntType(32), types.void, types.intp
@@ -46,17 +46,12 @@ NUMBER, WORD, LANE, VOID, ADDRESS = ir.FloatType(), ir.IntType(64), ir.IntType(3
 def _tile(rows: int, kind: int, lanes: int) -> Callable[..., None]:
     """Generate the innermost loop of a matrix multiplication: y = (x · weights) · scale + bias.
 
-    The loop computes `lanes` outputs of one panel (a block of 64 outputs) for `rows` rows. All sums stay in registers.
-
-    Args:
-        rows: Number of rows that are multiplied at once.
-        kind: Number format of the weights, HALF to BFLOAT.
-        lanes: Number of outputs that are computed at once.
+    The loop computes `lanes` outputs of one panel for `rows` rows. All sums stay in registers.
 
     Returns:
         A function of (weights, factors, inputs, x, stride, y, step). `inputs` is the number of inputs. `weights`
-        (inputs, PANEL), `factors` (2, PANEL; scales, then biases), `x` and `y` are memory addresses. Two rows of x are
-        `stride` bytes apart, and two rows of y are `step` bytes apart.
+            (inputs, PANEL), `factors` (2, PANEL; scales, then biases), `x` and `y` are memory addresses. Two rows of x
+            are `stride` bytes apart, and two rows of y are `step` bytes apart.
     """
     formats = {HALF: (ir.HalfType(), 2), INT8: (ir.IntType(8), 1), FLOAT: (NUMBER, 4), BFLOAT: (ir.IntType(16), 2)}
     stored, size = formats[kind]
@@ -108,15 +103,7 @@ def _tile(rows: int, kind: int, lanes: int) -> Callable[..., None]:
 
 
 def _product(kind: int, size: int) -> Callable[..., None]:
-    """Return a function that multiplies any number of rows with a whole matrix.
-
-    Its arguments are (weights, factors, inputs, panels, x, stride, rows, y, step). `panels` and `rows` are the numbers
-    of panels and rows. `_tile` explains the other arguments. The addresses point to the first panel.
-
-    Args:
-        kind: Number format of the weights, HALF to BFLOAT.
-        size: Bytes of one weight.
-    """
+    # the arguments of `_tile` for any number of rows and all panels; `size` is in bytes
     one, two, three, four, five, six = (_tile(n, kind, LANES if n > 1 else PANEL) for n in range(1, 7))
 
     @compiled
@@ -165,13 +152,11 @@ def _shift(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return builder.fmul(arguments[0], builder.bitcast(exponent, NUMBER))
 
 
+# `get` reads and `put` writes the float32 number at `index` in an array that begins at memory address `address`
 get = intrinsic(lambda typing, address, index: (types.float32(ADDRESS, ADDRESS), _read))
 put = intrinsic(lambda typing, address, index, value: (VOID(ADDRESS, ADDRESS, types.float32), _write))
+# x · 2^power for an integer power from −126 to 127
 times_two_to = intrinsic(lambda typing, x, power: (types.float32(types.float32, types.float32), _shift))
-"""`get` reads and `put` writes the float32 number at `index` in an array that begins at memory address `address`.
-
-`times_two_to` returns x · 2^power for an integer power from −126 to 127.
-"""
 
 _LOG2_E, _LN_2, _LN_2_REST = np.float32(math.log2(math.e)), np.float32(0.693359375), np.float32(-2.12194440e-4)
 _T2, _T3, _T4, _T5, _T6, _T7 = (np.float32(1 / math.factorial(n)) for n in range(2, 8))
@@ -190,7 +175,6 @@ def exponential(x):
 
 @compiled
 def copy(x, to, count):
-    """Copy `count` float32 numbers from address `x` to address `to`."""
     for i in range(count):
         put(to, i, get(x, i))
 
@@ -199,12 +183,7 @@ def copy(x, to, count):
 def rotate(x, to, cos, sin, channels):
     """Apply rotary position embedding to one head of one token.
 
-    Args:
-        x: Address of the head's `channels` numbers.
-        to: Address of the result.
-        cos: Address of the cosines.
-        sin: Address of the sines. In the first half of the channels their sign is reversed.
-        channels: C, size of the head.
+    All arguments but `channels` are addresses. In the first half of the channels the sign of the sines is reversed.
     """
     half = channels // 2
     for c in range(half):
@@ -221,8 +200,6 @@ def softmax(scores, slots, scale, mask, stop):
 
     Args:
         scores: Address of the scores, one per slot of the cache.
-        slots: Number of slots.
-        scale: Factor by which scores are multiplied, 1/√C.
         mask: Address of a number per slot. A slot is hidden if its number is not 0. The address 0 hides no slot.
         stop: Slots from this index on are hidden.
     """
@@ -260,10 +237,8 @@ def attention(frames, out, qkv, tables, cache, start, filled, mask, keys, values
         start: Number of valid slots in the cache. The new tokens get the next T slots.
         filled: Number of slots that are already copied to `keys` and `values`.
         mask: (T, start + T or more), 0 for slots that a token sees. Shape (0, 1) means that attention is causal.
-        keys: (B · A, panels, C, PANEL) copy of the cached keys in the layout of a matrix from channels to slots. One
-            matrix product with it gives the scores of a query. A panel holds PANEL slots.
-        values: (B · A, panels, slots, PANEL) copy of the cached values in the layout of a matrix from slots to
-            channels. One matrix product with it applies the attention weights. A panel holds PANEL channels.
+        keys: (B · A, panels, C, PANEL) copy of the cached keys, a matrix from channels to slots.
+        values: (B · A, panels, slots, PANEL) copy of the cached values, a matrix from slots to channels.
     """
     tokens, heads, channels = tables.shape[0], cache.shape[2], tables.shape[2]
     stop, size, parts = start + tokens, 4 * frames.shape[1], values.shape[1]
@@ -302,7 +277,6 @@ def attention(frames, out, qkv, tables, cache, start, filled, mask, keys, values
 
 @compiled
 def sum_of_exponentials(x, most):
-    """Return the sum of e^(x[i] − most) over all elements of the array `x`. `most` is the largest element."""
     total = _ZERO
     for i in range(len(x)):
         total += exponential(x[i] - most)
@@ -313,11 +287,8 @@ def sum_of_exponentials(x, most):
 def choose(frame, columns, numbers):
     """Choose the tokens of a chunk, and estimate the probability that all are accepted, like `early.drafter.choose`.
 
-    Args:
-        frame: (size,) float32, the memory of one row of the batch. It holds the logits, and afterwards the result.
-        columns: The operation's line in the table of operations, see `recording.COLUMNS`.
-        numbers: Constants of all operations. This operation has one per token: 1 if the token must equal the target's,
-            else 0.
+    `frame` (size,) holds the logits, and afterwards the result. The operation has a constant per token: 1 if it must
+    equal the target's.
     """
     out, a, rows, width, stride, first = columns[1], columns[2], columns[4], columns[5], columns[6], columns[7]
     radius, odds = int(frame[columns[3]]), _ONE
@@ -347,16 +318,9 @@ def choose(frame, columns, numbers):
 
 @compiled
 def elementwise(code, frame, columns, numbers, indices):
-    """Execute one operation on one frame (the memory of one row of the batch), in place.
+    """Execute one operation on one frame, in place.
 
-    `run` itself executes LINEAR, ATTEND and BRANCH.
-
-    Args:
-        code: The operation, such as ADD.
-        frame: (size,) float32.
-        columns: The operation's line in the table of operations, see `recording.COLUMNS`.
-        numbers: Constants of all operations.
-        indices: For all GATHER operations, the indices in the frame of the elements that they copy.
+    `columns` are its `recording.COLUMNS`. `run` itself executes LINEAR, ATTEND and BRANCH.
     """
     out, a, b = columns[1], columns[2], columns[3]
     rows, width, stride, first = columns[4], columns[5], columns[6], columns[7]
@@ -431,7 +395,6 @@ def branch(frames, columns, time, start, mask, results):
 
     Args:
         frames: (k, size), one frame per node. It holds the logits of the node's children, and the node's hidden state.
-        columns: The operation's line in the table of operations.
         time: Number of earlier executions.
         start: Slot of the first drafted node in the cache.
         mask: (k, slots), 0 for slots that a node sees. Afterwards 0 for slots that the new nodes see.
@@ -489,14 +452,12 @@ def run(
         end: Number of executions after this call, earlier calls included.
         last: Number of operations in the last execution. Operations that only prepare a further execution are left out.
         indices: Places (indices in a frame) that GATHER operations copy from.
-        numbers: Constants of all operations.
         frames: (B · T, size) float32, one frame (memory) per row. They hold the inputs, and afterwards the outputs.
         positions: (T,) rotary positions in execution 0, even if this call begins with a later execution.
         start: Number of valid slots in the cache before execution 0, even if this call begins with a later execution.
         cache: (layers, 2, B, A, slots, C) keys and values. New keys and values are appended.
         keys: (layers, B · A, panels, C, PANEL) copy of the keys, see `attention`.
         values: (layers, B · A, panels, slots, PANEL) copy of the values.
-        filled: Number of slots that are already copied to `keys` and `values`.
         mask: (T, start + T · times), 0 for slots that a row sees. Shape (0, 1) means that attention is causal.
         results: (times, 1, B · T), filled with the result of ARGMAX in each execution. For programs that draft a tree
             (times, 4, k²), filled by `branch`.
@@ -552,12 +513,10 @@ def best(results, top_k, nodes):
 
     Args:
         results: (times, 4, k²), filled by `branch` in all executions.
-        top_k: Number of children of a node.
-        nodes: Number of nodes to choose, at most.
 
     Returns:
         The n nodes' tokens (n,) and parents (n,), −1 for the root, and the mask (n, n) bool: entry [i, j] says whether
-        node j is node i or one of its ancestors.
+            node j is node i or one of its ancestors.
     """
     children = results.shape[2]
     count = top_k + (results.shape[0] - 1) * children

@@ -34,17 +34,12 @@ from kerv_cli.targets.checkpoint import load_state
 from kerv_cli.targets.compact.recording import ARGMAX, BFLOAT, BLOCKED, BRANCH, COLUMNS, FLOAT, HALF, INT8, PANEL, Tape
 
 _LOG = logging.getLogger("kerv")
-LARGE = 2**19
-"""A bfloat16 matrix with at least this many weights is stored in oneDNN's layout. The program multiplies smaller ones
-itself, because calling oneDNN would take longer than it saves."""
+LARGE = 2**19  # weights of a bfloat16 matrix from which on oneDNN's layout saves more than a call of oneDNN costs
 ROWS = 32  # oneDNN chooses the layout for this many rows; 154 M weights take 27 ms for 1 row, 33 for 31, 41 for 47
 
 
 def own_folder() -> Path:
-    """Return a temporary folder that only this user can write, so that kerv can safely run the code in it.
-
-    All processes of the user get the same folder. If another user has a folder of that name, a new one is made.
-    """
+    """Return a temporary folder of this user that no other user can write, so that running the code in it is safe."""
     folder = Path(tempfile.gettempdir(), f"kerv-{os.getuid()}")
     with contextlib.suppress(FileExistsError):
         folder.mkdir(mode=0o700)
@@ -58,8 +53,7 @@ def own_folder() -> Path:
 def kernels() -> ModuleType:
     """Return the module of compiled kernels.
 
-    The first process on a machine compiles them, and logs a warning that this takes fifteen seconds. Other processes
-    wait for it.
+    The first process on a machine compiles them, which takes fifteen seconds. Other processes wait for it.
     """
     import numba
     from numba.core import event
@@ -85,25 +79,18 @@ def kernels() -> ModuleType:
 
 @functools.lru_cache(maxsize=1)
 def multiplies_bfloat16() -> bool:
-    """Return whether this CPU and this build of torch can multiply bfloat16 matrices in blocked layout.
-
-    The CPU needs AMX or AVX512-BF16 instructions for this.
-    """
+    """Return whether this CPU (by AMX or AVX512-BF16) and torch multiply bfloat16 matrices in blocked layout."""
     supported = torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()
     return bool(supported) and bool(torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported())
 
 
 class Blocked:
-    """The weights of a linear layer in bfloat16, in the blocked layout of oneDNN, torch's matrix library for CPUs.
+    """The weights (outputs, inputs) of a linear layer in bfloat16, in oneDNN's blocked layout.
 
     One token and thirty tokens take almost the same time, because most time is spent on reading the weights. All other
     operations of a program are float32. They are cheap, and rounding them would more often make the two best logits
     almost equal. oneDNN adds in a different order for one token than for many, so the last bit of a result depends on
     the number of tokens (docs/measuring.md).
-
-    Args:
-        weight: (outputs, inputs) bfloat16.
-        bias: (outputs,). None means zeros.
     """
 
     def __init__(self, weight: Tensor, bias: Tensor | None) -> None:
@@ -111,7 +98,6 @@ class Blocked:
         self.bias = None if bias is None else bias.to(torch.bfloat16)
 
     def __call__(self, x: Tensor) -> Tensor:
-        """Map inputs (…, inputs) to outputs (…, outputs) bfloat16. The sums are computed in float32."""
         x = x.to(torch.bfloat16)
         product: Tensor = torch.ops.mkldnn._linear_pointwise(x, self.weight, self.bias, "none", [], "")
         return product
@@ -130,9 +116,7 @@ class Matrix:
     Attributes:
         values: (panels, inputs, PANEL) weights.
         factors: (panels, 2, PANEL) scale and bias of every output.
-        columns: Size, number format and addresses of the matrix, as entries of an operation in the table of operations
-            (see `recording.COLUMNS`).
-        nbytes: Bytes of the weights.
+        columns: Entries of an operation in the table of operations (`recording.COLUMNS`).
         blocked: The matrix in oneDNN's layout, without panels. None if the matrix is stored in panels.
     """
 
@@ -162,12 +146,10 @@ class Matrix:
         self.nbytes = outputs * inputs * self.values.element_size()
 
 
-_MATRICES = WeakIdKeyDictionary()
-"""The `Matrix` of each weight tensor. Programs with the same layer share the matrix."""
+_MATRICES = WeakIdKeyDictionary()  # weight tensor -> `Matrix`, which programs with the same layer share
 
 
 def stored_bytes(tensors: Iterable[Tensor]) -> float:
-    """Return the bytes of memory that weights take. Compiled weights count as they are stored in their `Matrix`."""
     return float(sum(_MATRICES.get(x, x).nbytes for x in tensors))
 
 
@@ -220,17 +202,14 @@ class Program:
     def __call__(
         self, *inputs: Tensor, positions: Tensor | None = None, cache: Cache | None = None, mask: Tensor | None = None
     ) -> list[Tensor]:
-        """Compute the outputs. Each has as many rows as the inputs.
+        """Compute the outputs, (rows, …) each.
 
         Args:
             inputs: (rows, …). If the program has attention, (B, T, …): B sequences of T tokens, which are B · T rows.
             positions: (T,) rotary positions. None if the program has no attention.
-            cache: Keys and values of earlier tokens. The keys and values of the new tokens are written after them, but
-                `cache.length` stays as it is. None if there are no earlier tokens.
+            cache: The keys and values of the new tokens are written after the cached ones, but `cache.length` stays as
+                it is.
             mask: Result of `attention_mask`. If None, attention is causal.
-
-        Returns:
-            The outputs, (rows, …) each.
         """
         frames = self._execute(inputs, positions, cache, mask)
         found = []
@@ -243,10 +222,8 @@ class Program:
         """Execute the program several times in one call. The outputs of one execution are the inputs of the next.
 
         Args:
-            times: Number of executions.
             inputs: Inputs of the first execution: one token for each of B sequences.
-            cache: Keys and values of earlier tokens. Each execution appends the keys and values of one more token, but
-                `cache.length` stays as it is.
+            cache: Each execution appends the keys and values of one more token, but `cache.length` stays as it is.
             end: Stop after an execution whose result for the first sequence is this token. If None, never stop early.
 
         Returns:
@@ -266,16 +243,15 @@ class Program:
 
         Args:
             levels: Maximum number of tokens on a path.
-            top_k: Number of nodes per level that get children, and number of children of each.
             nodes: Maximum number of nodes of the tree.
             inputs: Inputs of the program for the tree's root.
             position: Rotary position of the tree's first level.
-            cache: Keys and values of earlier tokens. The program writes the keys and values of drafted tokens after
-                them, but leaves `cache.length` as it is.
+            cache: The keys and values of drafted tokens are written after the cached ones, but `cache.length` stays as
+                it is.
 
         Returns:
             Tokens (n,), parents (n,) with −1 for the root, and the mask (n, n) bool: entry [i, j] says whether node j
-            is node i or one of its ancestors.
+                is node i or one of its ancestors.
         """
         results = np.empty((levels, 4, top_k * top_k), np.float32)
         mask = torch.ones(top_k, cache.length + levels * top_k)
@@ -294,16 +270,11 @@ class Program:
         results: np.ndarray | None = None,
         end: int | None = None,
     ) -> np.ndarray:
-        """Execute the program once, or `times` times if `results` is given. Return the frames (rows, size).
+        """Execute the program as many times as `results` has rows, or once. Return the frames (rows, size).
 
         Args:
-            inputs: Inputs of the first execution.
-            positions: (T,) rotary positions. None if the program has no attention.
-            cache: Keys and values of earlier tokens. None if there are no earlier tokens.
-            mask: Result of `attention_mask`. If None, attention is causal.
             results: (times, 1, B) float32, or (levels, 4, top_k²) for `grow`. It is filled with the results of each
-                execution. If None, execute once.
-            end: Stop after an execution whose result for the first sequence is this token. If None, never stop early.
+                execution.
         """
         where = np.zeros(1, np.int64) if positions is None else positions.numpy()
         rows, tokens = inputs[0].numel() // self.places[0][1], len(where)
@@ -331,10 +302,7 @@ class Program:
         return frames
 
     def _alternate(self, times: int, end: int, frames: np.ndarray, *rest: Any) -> None:
-        """Execute a program in which oneDNN multiplies some of the matrices.
-
-        One compiled call executes all operations between two multiplications by oneDNN.
-        """
+        # one compiled call executes all operations between two multiplications by oneDNN
         memory, run = torch.from_numpy(frames), self.run
         where, start, buffer, keys, values, filled, seen, results = rest
         for time in range(times):
@@ -353,12 +321,11 @@ class Program:
 
 
 def _executed(results: np.ndarray) -> int:
-    """Return how many executions ran: the rows of `results` (times, 1, B) whose first number is not NOTHING."""
     return int((results[:, 0, 0] != NOTHING).sum())
 
 
 def _columns_of(op: dict[str, Any]) -> list[tuple[slice, slice]]:
-    """Return two slices of a frame for each row of a large matrix's input: the row's input and the row's result."""
+    # two slices of a frame for each row of a large matrix's input: the row's input and the row's result
     columns = []
     for row in range(op["rows"]):
         a, out = op["a"] + row * op["stride"], op["out"] + row * op["step"]
@@ -375,9 +342,6 @@ class Compilable(nn.Module):
     If the module is moved or unfrozen, or weights are loaded into it, the compiled form is discarded and torch computes
     as usual. A copy has no compiled form. After changing weights in any other way (`parameter.data`, a submodule's own
     `load_state_dict`), call `compile_parts` again.
-
-    Attributes:
-        compiled: The compiled form. None if the module is not compiled.
     """
 
     compiled: Any = None
@@ -387,11 +351,7 @@ class Compilable(nn.Module):
         return None
 
     def runs_compiled(self, *inputs: Tensor) -> bool:
-        """Return whether to use the compiled form: True if it exists and no gradients are needed.
-
-        While a program is recorded, the inputs are `Recorded`. The result is then False, so that torch's form is
-        recorded.
-        """
+        """Return whether a compiled form exists, no gradients are needed, and nothing is being recorded."""
         for x in inputs:
             if not isinstance(x, Tensor) or (x.requires_grad and torch.is_grad_enabled()):
                 return False
@@ -409,7 +369,6 @@ class Compilable(nn.Module):
         super()._load_from_state_dict(*arguments, **keywords)
 
     def requires_grad_(self, requires_grad: bool = True) -> Self:
-        """Freeze or unfreeze all parameters. Unfreezing discards the compiled form of every submodule, too."""
         for part in self.modules():
             if requires_grad and isinstance(part, Compilable):
                 part.compiled = None
@@ -420,11 +379,9 @@ class CompilableLinear(Compilable, nn.Linear):
     """A linear layer that is compiled by itself, not as a part of a larger module. An example is an output head."""
 
     def new_program(self) -> Program:
-        """Return the compiled layer."""
         return Program(super().forward, (1, self.in_features))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map inputs (…, in_features) to outputs (…, out_features). The compiled form returns float32."""
         return self.compiled(x)[0].view(*x.shape[:-1], -1) if self.runs_compiled(x) else super().forward(x)
 
 
@@ -446,15 +403,7 @@ def compile_parts(module: nn.Module) -> None:
 
 
 def load_compiled(module: M, folder: Path, kind: str, device: str | torch.device, dtype: torch.dtype) -> M:
-    """Load the weights in a folder into a module. Move it to a device, freeze it, and on a CPU compile it.
-
-    Args:
-        module: A module with the shapes of the stored weights.
-        folder: Folder with `model.safetensors`.
-        kind: Kind of artifact, such as `drafter`, for error messages.
-        device: Device to move the module to.
-        dtype: Number format to convert the weights to.
-    """
+    """Load the weights in a folder into a module. Move it to a device, freeze it, and on a CPU compile it."""
     load_state(module, folder, kind)
     module = module.to(device=device, dtype=dtype).eval().requires_grad_(False)
     compile_parts(module)

@@ -22,28 +22,23 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+# codes of the operations
 LINEAR, NORM, SILU, TANH, ADD, MULTIPLY, AFFINE, CLAMP, GATHER, EMBED, ARGMAX, ATTEND, BRANCH, CHOOSE = range(14)
-"""Codes of the operations."""
+# formats of weights: float16, int8 with a scale per output, float32, bfloat16, and bfloat16 in oneDNN's layout
 HALF, INT8, FLOAT, BFLOAT, BLOCKED = range(5)
-"""Number formats in which the weights of a matrix can be stored: float16, int8 with a scale per output, float32,
-bfloat16, and bfloat16 in oneDNN's layout (`program.Blocked`)."""
-PANEL = 64
-"""Number of outputs in a panel. A matrix is stored panel by panel."""
+PANEL = 64  # outputs in a panel; a matrix is stored panel by panel
+# columns of the table of operations, all int64; a column that an operation does not use is 0
+#   code: the operation, LINEAR to CHOOSE
+#   out, a, b: place of the first element of the result, of the first input and of the second input
+#   rows, width: number of rows of the input, and of elements per row
+#   stride: distance between two input rows in elements; ATTEND: the layer's index in the cache; BRANCH: size of a
+#       hidden state
+#   first: index of the operation's first constant in `Tape.numbers`; GATHER: of its first entry in `Tape.indices`
+#   step: distance between two result rows in elements
+#   weights, factors: memory addresses of a matrix's weights, and of its scales and biases
+#   panels: number of panels of the matrix; BLOCKED: of outputs
+#   kind: number format of the weights, HALF to BLOCKED
 COLUMNS = ["code", "out", "a", "b", "rows", "width", "stride", "first", "step", "weights", "factors", "panels", "kind"]
-"""Columns of the table of operations, all int64. A column that an operation does not use is 0.
-
-code: The operation, `LINEAR` to `CHOOSE`.
-out, a, b: Place of the first element of the result, of the first input and of the second input.
-rows, width: Number of rows of the input, and of elements per row.
-stride: Distance between two input rows in elements. For ATTEND the index of the layer in the cache; for BRANCH the size
-    of a hidden state.
-first: Index of the operation's first constant among all `Tape.numbers`. For GATHER the index of the operation's first
-    entry in `Tape.indices`.
-step: Distance between two result rows in elements.
-weights, factors: Memory addresses of a matrix's weights, and of its scales and biases.
-panels: Number of panels of the matrix. For a BLOCKED matrix the number of outputs.
-kind: Number format of the weights, HALF to BLOCKED.
-"""
 _ALIGNED = 16  # registers begin at multiples of this place
 _VIEWS = frozenset({"view", "flatten", "unflatten", "chunk", "split", "expand"})
 
@@ -52,9 +47,7 @@ class Recorded:
     """Stand-in for a float32 tensor of batch size 1 on a CPU. Operations on it are recorded, not computed.
 
     Attributes:
-        tape: The tape that records operations on this value.
         place: Integer tensor. It holds the index of each element in the float32 memory (frame) of one batch row.
-        shape: The shape of the tensor and of `place`.
     """
 
     requires_grad = is_cuda = False
@@ -65,7 +58,6 @@ class Recorded:
 
     @property
     def first(self) -> int:
-        """Place (index in the frame) of the first element."""
         return int(self.place.flatten()[0])
 
     @classmethod
@@ -86,7 +78,6 @@ class Recorded:
         return Recorded(self.tape, self.place[index])
 
     def to(self, *_: Any) -> Recorded:
-        """Return the value unchanged. Recorded values are always float32 on a CPU."""
         return self
 
     def __add__(self, other: Any) -> Recorded:
@@ -109,27 +100,22 @@ class Recorded:
         return self.tape.elementwise(AFFINE, Recorded(self.tape, place), numbers=numbers)
 
     def clamp(self, low: float, high: float) -> Recorded:
-        """Limit every element to low … high."""
         return self.tape.elementwise(CLAMP, self, numbers=[low, high])
 
     def mean(self, dim: int) -> Recorded:
-        """Return the mean over dimension 1. `dim` must be 1."""
         assert dim == 1
         first, *others = self.split(1, 1)
         return (sum(others, start=first) / self.shape[1])[:, 0]
 
     def argmax(self, dim: int) -> Recorded:
-        """Return the index (1,) of the greatest of all elements. `dim` must be -1."""
         assert dim == -1
         return self.tape.emit(ARGMAX, (1,), [self], self.place.numel())
 
     def branch(self, hidden: Recorded) -> tuple[Recorded, Recorded]:
         """Record the operation that grows one level of a draft tree; see `Program.grow`.
 
-        Each row of the batch stands for one node of the tree. This value has the logits of the node's children.
-
-        Args:
-            hidden: (…, E) hidden state of the row's node.
+        Each row of the batch stands for one node of the tree. This value has the logits of the node's children,
+        `hidden` (…, E) is the node's hidden state.
 
         Returns:
             The token (1,) of the node that the row stands for afterwards, and the hidden state (…, E) of its parent.
@@ -154,12 +140,8 @@ class Recorded:
         """Record the attention of the next layer. This value has 3 E columns: E of queries, E of keys, E of values.
 
         Args:
-            heads: Number of attention heads, with C channels each. Together they have E channels.
             cos: (positions, 1, C) rotary cosines, for every position that can occur.
             sin: (positions, 1, C) rotary sines.
-
-        Returns:
-            The attention's output (…, E).
         """
         tape, width = self.tape, self.shape[-1] // 3
         layer, tables = tape.cache[0], torch.cat([cos, sin], 1)
@@ -170,15 +152,12 @@ class Recorded:
 class Tape:
     """The operations that were recorded so far, and their constants.
 
-    A frame is the float32 memory of one row of the batch. A place is an index in the frame.
-
     Attributes:
         ops: One dictionary per operation, with the names in COLUMNS as keys.
         numbers: Constant arrays, such as norm gains.
         indices: Places of the elements that GATHER operations copy: those of the first such operation, then those of
             the second, and so on.
-        begins: First place of each register. A register is the range of places that holds one tensor. The last entry
-            is the first place of the next register.
+        begins: First place of each register. The last entry is the first place of the next register.
         cache: Three numbers for the cache: layers with attention, heads of a layer, channels of a head.
     """
 
@@ -190,7 +169,6 @@ class Tape:
         self.cache = 0, 1, 1
 
     def register(self, shape: Sequence[int]) -> Recorded:
-        """Reserve a register (a contiguous range of places in the frame) for a tensor of this shape, and return it."""
         first, size = self.begins[-1], int(np.prod(shape))
         self.begins.append(first + size + 1)  # one unused place, so that `lined` never takes two registers for one
         return Recorded(self, torch.arange(first, first + size).view(*shape))
@@ -204,19 +182,14 @@ class Tape:
         numbers: Any = (),
         **columns: Any,
     ) -> Recorded:
-        """Append an operation.
+        """Append an operation, and return its result.
 
         Args:
-            code: What the operation computes, such as LINEAR.
             out: Value that receives the result, or the shape of a new register for the result.
             inputs: One or two values that the operation reads. The first value is read in rows of `width` elements. The
                 second value is read as one row with all its elements, whatever its shape is.
-            width: Number of elements in each row of the first input.
             numbers: Constants that the operation reads, such as a norm's gain.
             **columns: Further entries of the operation, with the names in COLUMNS.
-
-        Returns:
-            The result.
         """
         out = out if isinstance(out, Recorded) else self.register(out)
         x, rows, stride = self.lined(inputs[0], width)
@@ -230,11 +203,7 @@ class Tape:
         return out
 
     def lined(self, x: Recorded, width: int) -> tuple[Recorded, int, int]:
-        """Return `x` if its rows are contiguous and equally spaced in the frame. Else return a copy with such rows.
-
-        Args:
-            x: The value.
-            width: Number of elements in a row.
+        """Return `x`, or a copy if its rows of `width` elements are not equally spaced in the frame.
 
         Returns:
             `x` or its copy, the number of rows, and the distance between the starts of two rows, in elements.
@@ -246,7 +215,6 @@ class Tape:
         return self.copied(x, self.register(x.shape)), len(rows), width
 
     def copied(self, x: Recorded, out: Recorded) -> Recorded:
-        """Append an operation that copies the elements of `x`, in order, into the register of `out`. Return `out`."""
         places = x.place.flatten().tolist()
         op = {"code": GATHER, "out": out.first, "rows": 1, "width": len(places), "first": len(self.indices)}
         self.ops.append({**op, "reads": [x.place]})
@@ -254,13 +222,6 @@ class Tape:
         return out
 
     def elementwise(self, code: int, *inputs: Recorded, numbers: Any = ()) -> Recorded:
-        """Append an elementwise operation on inputs, which are broadcast to one shape. Return the result.
-
-        Args:
-            code: What the operation computes, such as ADD.
-            inputs: One or two values.
-            numbers: Constants that the operation reads.
-        """
         shape = torch.broadcast_shapes(*(x.shape for x in inputs))
         inputs = tuple(x.expand(shape) for x in inputs)
         return self.emit(code, shape, inputs, shape.numel(), numbers) if shape.numel() else inputs[0]
@@ -276,15 +237,9 @@ class Tape:
         return first
 
     def arrange(self, kept: Sequence[Recorded]) -> int:
-        """End a recording: give every tensor its final place in the frame, the memory of one row of a batch.
+        """End a recording: give every tensor its final place in the frame, and return the frame's size in numbers.
 
-        Tensors that are never needed at the same time may share memory.
-
-        Args:
-            kept: Inputs and outputs of the recorded function. They share memory with no other tensor.
-
-        Returns:
-            The size of a frame, as a number of float32 values.
+        Tensors that are never needed at the same time may share memory, except the inputs and outputs `kept`.
         """
         begins, sizes = np.array(self.begins), np.diff(self.begins)
 

@@ -46,7 +46,7 @@ class Inputs:
 
     Attributes:
         images: (B, 3, size, size · views) uint8, all camera views side by side. None if the policy reads the state.
-        proprioception: (B, p) float32, the robot's own measurements.
+        proprioception: (B, p) float32.
         states: (B, s) float32, the simulator's state. A policy that reads images ignores it.
         words: (B, L) int64, ids of the instruction's words.
     """
@@ -61,7 +61,6 @@ class Programs(NamedTuple):
     """The compiled programs of a target.
 
     Attributes:
-        prompt: Program that encodes a prompt.
         step: Program that reads a token, and returns the most probable next token and the hidden state. The next token
             can become the next input, so that one call of `Program.repeat` decodes several tokens.
     """
@@ -74,28 +73,15 @@ class CompactTarget(Compilable):
     """The compact policy: encoders, trunk and head. Implements the protocol `ReadableTarget`.
 
     Args:
-        settings: Shapes of the networks, such as width and number of layers.
-        actions: Action space.
-        observation: Observation space.
-        words: Vocabulary of instructions.
         camera: Name of the camera. Names that are joined with `+` stand for one image of several camera views.
 
     Attributes:
         cameras: A tuple with one name, the camera whose images are read. Empty if the policy reads the state.
-        frame_shape: Shape (height, width, 3) of an image.
-        segments: Slice of prompt positions that each part of the prompt takes, by the part's name.
         max_prompt: P, number of prompt tokens. It is the same for every observation and instruction.
-        pooled_width: F, number of values that `pooled` returns per prompt.
         sha256: Hash of the weights that were loaded. Empty if no weights were loaded.
-        chunk: H, number of control steps that the policy was trained to decode at once.
-        parallel: Whether the policy decodes all tokens in one forward (`parallel_pass`). It then cannot decode single
-            tokens.
-        width: E, width of the embeddings and hidden states.
-        heads: Number of attention heads per layer. The layers of a drafter have as many.
-        feed_forward: Number of hidden units per layer. The layers of a drafter have as many.
+        parallel: Whether the policy decodes all tokens in one forward (`parallel_pass`), and not single tokens.
         enlarges: Function that enlarges a drafter in place, as this target was enlarged (docs/methods.md §0.2). None if
             drafters stay as they are.
-            A vision policy estimates the object's position. None until `encode` has read an observation.
     """
 
     centre: Tensor
@@ -144,18 +130,11 @@ class CompactTarget(Compilable):
 
     @property
     def encoders(self) -> tuple[VisionEncoder, ...]:
-        """The encoders of a vision policy, one per camera view. Their order is that of the views in the image.
-
-        The views lie side by side in the image. The first encoder reads the leftmost view.
-        """
+        """The encoders of a vision policy, one per camera view, from left to right in the image."""
         return self.vision, *self.further_views
 
     def pooled(self, prompt: Tensor) -> Tensor:
-        """Summarise each prompt of P tokens (B, P, E) as one vector of F numbers (B, F).
-
-        A vector holds the scene tokens, the proprioception token, the mean of the word tokens, and for a vision policy
-        the mean of the vision tokens.
-        """
+        """Return (B, F): scene tokens, proprioception token, mean of the word tokens, and of the vision tokens."""
         parts = self.segments
         pooled = [prompt[:, parts["scene"]].flatten(1), prompt[:, parts["proprioception"]].flatten(1)]
         pooled += [prompt[:, parts[name]].mean(1) for name in ("instruction", "vision") if name in parts]
@@ -163,21 +142,17 @@ class CompactTarget(Compilable):
 
     @property
     def device(self) -> torch.device:
-        """Device of the weights."""
         return self.head.weight.device
 
     @property
     def layers(self) -> nn.ModuleList:
-        """Decoder layers of the trunk."""
         return self.trunk.layers
 
     @property
     def dtype(self) -> torch.dtype:
-        """Number format of the weights."""
         return self.head.weight.dtype
 
     def inputs(self, observation: Observation) -> Inputs:
-        """Return an observation as tensors on this target's device, a batch of one."""
         proprioception = upload(np.asarray(observation.proprioception, dtype=np.float32), self.device)[None]
         state = upload(np.asarray(observation.state, dtype=np.float32), self.device)[None]
         given = proprioception.shape[1], state.shape[1]
@@ -202,21 +177,15 @@ class CompactTarget(Compilable):
         return Inputs(images, proprioception, state, upload([words], self.device))
 
     def encode(self, observation: Observation) -> Tensor:
-        """Encode an observation as a prompt (1, P, E)."""
         return self.encode_batch(self.inputs(observation))[0]
 
     def encode_many(self, observations: Sequence[Observation]) -> Tensor:
-        """Encode B observations as prompts (B, P, E)."""
         columns: Any = zip(*(vars(inputs).values() for inputs in map(self.inputs, observations)), strict=True)
         joined: Any = (None if column[0] is None else torch.cat(column) for column in columns)
         return self.encode_batch(Inputs(*joined))[0]
 
     def encode_batch(self, inputs: Inputs) -> tuple[Tensor, Tensor]:
-        """Encode a batch of observations.
-
-        Returns:
-            Prompts (B, P, E), and the 3D positions (B, K, 3) in metres of the task's places, such as object and goal.
-        """
+        """Return prompts (B, P, E), and the positions (B, K, 3) in metres of places such as object and goal."""
         given = [inputs.words, inputs.proprioception, inputs.states]
         if self.cameras:
             assert inputs.images is not None
@@ -230,9 +199,7 @@ class CompactTarget(Compilable):
         return self.prompt(*given)
 
     def prompt(self, words: Tensor, proprioception: Tensor, *seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute in torch what `encode_batch` returns: prompts (B, P, E), and positions (B, K, 3) in metres.
-
-        While a program is recorded, all arguments are `Recorded`, stand-ins for tensors.
+        """Compute in torch what `encode_batch` returns.
 
         Args:
             words: (B, L) ids of words.
@@ -254,7 +221,7 @@ class CompactTarget(Compilable):
         return torch.cat([*tokens, embedded, scene, felt], 1), places
 
     def located(self, points: Tensor, hand: Tensor, words: Tensor) -> Tensor:
-        """Estimate the 3D positions (B, K, 3) of the task's places (object, goal, …) in metres.
+        """Estimate the positions (B, K, 3) of the task's places (object, goal, …) in metres.
 
         Args:
             points: (B, 2 · keypoints · views) image points.
@@ -267,7 +234,6 @@ class CompactTarget(Compilable):
         return located.to(torch.float32).unflatten(-1, (-1, 3)) * 0.1 + self.centre
 
     def new_program(self) -> Programs:
-        """Return compiled programs that encode a prompt and decode tokens."""
         s, space = self.settings, self.observation
         shapes: list[tuple[int, ...]] = [(1, s.instruction_tokens), (1, len(space.proprioception))]
         if self.cameras:
@@ -283,31 +249,22 @@ class CompactTarget(Compilable):
         return Programs(Program(self.prompt, *shapes), Program(step, (1, 1), repeats=True))
 
     def join(self, function: Callable[..., Any], *shapes: tuple[int, ...], repeats: bool = False) -> Program | None:
-        """Compile a function that calls modules of the target and of a drafter, as `JoinsDrafters.join` explains."""
         return Program(function, *shapes, repeats=repeats) if self.compiled is not None else None
 
     def enlarge(self, drafter: Any) -> None:
-        """Enlarge a drafter in place, if this is a grown target whose recipe enlarges the drafter, too."""
         if self.enlarges is not None:
             self.enlarges(drafter)
 
     def embed(self, tokens: Tensor) -> Tensor:
-        """Return the embeddings (B, T, E) of action tokens (B, T) int64."""
         return self.embedding(tokens)
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
-        """Return an empty key/value cache. `LayerStack.new_cache` explains the arguments."""
         return self.trunk.new_cache(batch, capacity, fixed)
 
     def forward(self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: Seen = None) -> Tensor:
-        """Return the hidden states (B, T, E) of embeddings x (B, T, E). `Target.forward` explains the arguments."""
         return self.trunk(x, positions, cache, seen)
 
     def continue_greedily(self, token: int, count: int, cache: Cache, end: int | None = None) -> list[int] | None:
-        """Decode the next `count` tokens greedily in one compiled call. None if this target is not compiled.
-
-        `ContinuesGreedily` explains the arguments.
-        """
         if self.compiled is None or cache.fixed:
             return None
         tokens = self.compiled.step.repeat(count, torch.tensor([[token]]), cache=cache, end=end)
@@ -315,10 +272,6 @@ class CompactTarget(Compilable):
         return tokens[:, 0].astype(int).tolist()
 
     def predict(self, tokens: Tensor, positions: Tensor, cache: Cache, seen: Seen) -> tuple[Tensor, Tensor]:
-        """Predict the token after each of T new tokens, in one call if this target is compiled.
-
-        `PredictsTokens.predict` explains arguments and results.
-        """
         if self.compiled is None or cache.fixed:
             hidden = self(self.embed(tokens[None]), positions, cache, seen)
             return self.head(hidden[0]).argmax(-1), hidden
@@ -328,13 +281,9 @@ class CompactTarget(Compilable):
         return found[:, 0].long(), hidden.view(1, len(tokens), -1).to(self.dtype)
 
     def parallel_pass(self, prompt: Tensor, cache: Cache | None = None) -> Tensor:
-        """Return the hidden states (B, N, E) of all N tokens of a chunk in one forward (docs/methods.md §6).
+        """Forward learned queries in place of action tokens (docs/methods.md §6).
 
-        Learned queries take the place of action tokens. They attend to the prompt and to each other.
-
-        Args:
-            prompt: (B, P, E).
-            cache: An empty cache, which this call fills. If None, no cache is used.
+        They attend to the prompt and to each other.
         """
         x = torch.cat([prompt, self.queries.to(prompt.dtype).expand(len(prompt), -1, -1)], 1)
         visible = np.tri(x.shape[1], dtype=bool)
@@ -342,14 +291,9 @@ class CompactTarget(Compilable):
         return self(x, torch.arange(x.shape[1], device=x.device), cache, visible)[:, prompt.shape[1] :]
 
     def teacher_forced(self, inputs: Inputs, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """Predict every token of a chunk from the true tokens before it, for training.
+        """Return logits (B, N, V) of the true tokens (B, N) of a chunk, and the positions (B, K, 3) of `encode_batch`.
 
-        Args:
-            inputs: B observations.
-            tokens: (B, N) the true tokens. A parallel target does not read them.
-
-        Returns:
-            Logits (B, N, V), and the 3D positions (B, K, 3) in metres of the task's places, such as object and goal.
+        A parallel target does not read the tokens.
         """
         prompt, places = self.encode_batch(inputs)
         if self.parallel:
@@ -368,10 +312,7 @@ def _segments(settings: TargetSettings, views: int) -> Mapping[str, slice]:
 
 
 def _smooth_table(tokens: int, width: int) -> Tensor:
-    """Return an initial embedding (V, E) in which neighbouring tokens are similar.
-
-    Each of the E numbers is a cosine of the token's value, with a random frequency and phase.
-    """
+    # neighbouring tokens are similar: each number is a cosine of the token's value, with random frequency and phase
     centres = torch.linspace(-1, 1, tokens)[:, None]
     generator = torch.Generator().manual_seed(0)
     frequency = torch.exp(torch.rand(width, generator=generator) * 4.0)  # up to 55 rad per unit
@@ -390,13 +331,9 @@ def save_target(
     """Write a target's weights and `target.json`. Return the SHA-256 of the weights.
 
     Args:
-        folder: Folder to write to.
-        target: The target.
         environment: Name of the environment that the target's demonstrations come from.
-        provenance: How the target was made, see `provenance_of`.
         stored: Number format of the stored weights: float32, float16 or int8.
-        state_range: The 0.1th percentiles, then the 99.9th percentiles, of the demonstrations' states. Each sequence
-            has one percentile per number of the state. None if the range was not measured.
+        state_range: As in `TargetDescription`.
     """
     others: dict[str, Any] = {"cameras": target.cameras, "words": target.words.words, "provenance": provenance}
     if state_range:
@@ -407,14 +344,7 @@ def save_target(
 
 
 def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> CompactTarget:
-    """Load a compact target for inference. The target is frozen and, on a CPU, compiled.
-
-    Args:
-        folder: Folder with the weights.
-        description: The content of the target's `target.json`.
-        device: Device to load the target to.
-        dtype: Number format to convert the weights to.
-    """
+    """Load a compact target for inference. The target is frozen and, on a CPU, compiled."""
     settings = read(TargetSettings, description.settings, str(folder / "target.json"))
     camera = description.cameras[0] if description.cameras else ""
     words = WordTokenizer(description.words)

@@ -41,7 +41,6 @@ class Rotary(nn.Module):
         self.register_buffer("sin", torch.cat([-angles.sin(), angles.sin()], -1), persistent=False)
 
     def forward(self, positions: Tensor | slice) -> Rotation:
-        """Return the cosines and the sines, (T, 1, C) each, at positions (T,)."""
         return self.cos[positions][:, None], self.sin[positions][:, None]
 
 
@@ -67,8 +66,6 @@ class Layer(nn.Module):
             x: (B, T, width) input: a tensor, or its stand-in `Recorded` while a program is recorded.
             rotary: Cosines and sines, (T, 1, C) each.
             cache: (2, B, A, capacity, C) keys and values of this layer's A heads. None if there are no earlier tokens.
-            slots: Slots of the cache that the new keys and values are written to.
-            mask: Result of `attention_mask`. If None, attention is causal.
         """
         qkv = self.qkv(self.attention_norm(x))
         if isinstance(qkv, Tensor):
@@ -88,7 +85,6 @@ class LayerStack(Compilable):
         inputs: Number of input tensors (B, T, E).
         width: Width inside the layers.
         outer: E, width of inputs and outputs.
-        heads: Number of attention heads.
         depth: Number of layers.
         padding: Number of tokens that are appended to a prompt, hidden by the mask, and dropped after the prefill. The
             prefill then costs as much as for a longer prompt (`targets/grown.py`).
@@ -106,7 +102,6 @@ class LayerStack(Compilable):
 
     @property
     def weight(self) -> Tensor:
-        """One of the weights. All weights have the same device and number format."""
         return next(self.parameters())
 
     def enter(self, *inputs: Tensor) -> Tensor:
@@ -114,22 +109,14 @@ class LayerStack(Compilable):
         return inputs[0]
 
     def begin(self, *inputs: Tensor) -> Tensor:
-        """Return the first layer's input (B, T, width): the combined inputs (B, T, E), padded with zeros."""
         x, rest = self.enter(*inputs), self.width - self.outer
         return x if not rest else torch.cat([x, x[..., :1].expand(*x.shape[:-1], rest) * 0.0], -1)
 
     def finish(self, x: Tensor) -> Tensor:
-        """Return the hidden states (B, T, E): cut x (B, T, width) to its first E channels, and apply the final norm."""
         return self.norm(x if self.width == self.outer else x[..., : self.outer])
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
-        """Return an empty key/value cache.
-
-        Args:
-            batch: Number of sequences.
-            capacity: Maximum number of tokens.
-            fixed: Whether every forward attends to all slots, so that all shapes are fixed. If None, only on CUDA.
-        """
+        """Return an empty key/value cache. `fixed` is whether all its shapes are fixed. If None, only on CUDA."""
         like = self.weight
         if self.compiled is not None:
             like = like.float()
@@ -138,7 +125,6 @@ class LayerStack(Compilable):
         return CapturedCache(*sizes, like) if fixed else Cache(*sizes, like)
 
     def new_program(self) -> Program:
-        """Return the stack as a compiled `Program`, for `compile_parts`."""
         return Program(self.recorded, *[(1, 1, self.outer)] * self.inputs)
 
     def run(self, inputs: Sequence[Tensor], positions: Tensor, cache: Cache | None, seen: Seen) -> Tensor:
@@ -147,9 +133,9 @@ class LayerStack(Compilable):
         Args:
             inputs: Tensors (B, T, E), as `enter` takes them.
             positions: (T,) rotary positions of the new tokens.
-            cache: Keys and values of earlier tokens. This forward appends the new ones. None if there is no cache.
-            seen: (T, M) bool, which of the last M tokens, old or new, each new token attends to. If None, attention
-                is causal.
+            cache: Keys and values of earlier tokens. This forward appends the new ones.
+            seen: (T, M) bool, which of the last M tokens, old or new, each new token attends to. If None, attention is
+                causal.
         """
         tokens, padding = inputs[0].shape[1], 0 if cache is not None and cache.length else self.padding
         if padding:
@@ -173,32 +159,16 @@ class LayerStack(Compilable):
         return hidden[:, :tokens]
 
     def captures(self, x: Tensor) -> bool:
-        """Return whether a forward of x (B, T, E) can run in a CUDA graph: on a GPU, with B = 1, without gradients."""
         return x.is_cuda and x.shape[0] == 1 and not (x.requires_grad and torch.is_grad_enabled())
 
     def recorded(self, *inputs: Tensor) -> Tensor:
-        """Record the operations of all layers on one token, to compile them. Nothing is computed.
-
-        Args:
-            *inputs: Stand-ins (`Recorded`) for the input tensors (1, 1, E). Their tape stores the operations.
-
-        Returns:
-            The stand-in for the hidden state (1, 1, E).
-        """
+        """Record the layers' operations on one token, to compile them. Inputs and result are `Recorded` (1, 1, E)."""
         return self.finish(self.run_layers(self.begin(*inputs), slice(None), None, None, None))
 
     def run_layers(
         self, x: Tensor, positions: Tensor | slice, cache: Cache | None, slots: Slots, mask: Tensor | None
     ) -> Tensor:
-        """Return the output of the last layer, computed by torch.
-
-        Args:
-            x: (B, T, width) input of the first layer.
-            positions: (T,) rotary positions.
-            cache: Keys and values of earlier tokens. None if there are no earlier tokens.
-            slots: Slots of the cache that the new keys and values are written to.
-            mask: Result of `attention_mask`. If None, attention is causal.
-        """
+        """Return the output (B, T, width) of the last layer for x (B, T, width), computed by torch."""
         rotary = self.rotary(positions)
         for i, layer in enumerate(self.layers):
             x = layer(x, rotary, cache.layers[i] if cache is not None else None, slots, mask)
@@ -217,5 +187,4 @@ class Trunk(LayerStack):
                     parameter.data /= (2 * layers) ** 0.5
 
     def forward(self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: Seen = None) -> Tensor:
-        """Return the hidden states (B, T, E) of embeddings x (B, T, E). `run` explains the arguments."""
         return self.run((x,), positions, cache, seen)

@@ -19,8 +19,7 @@ from kerv_cli.base.manifests import read
 if TYPE_CHECKING:
     from kerv_cli.base.spaces import ActionSpace
 
-SHAPES = "vision_shapes"
-"""Field of `config.json` with the shape of each vision tower. Published checkpoints do not have it."""
+SHAPES = "vision_shapes"  # shape of each vision tower; published checkpoints lack it
 CONFIG, STATISTICS = "config.json", "dataset_statistics.json"
 DOFS = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
 
@@ -30,10 +29,7 @@ class Tower:
     """Shape of a vision tower, one of OpenVLA's two vision transformers.
 
     Attributes:
-        width: Number of channels.
         depth: Number of blocks. The output of the last block is never used.
-        heads: Number of attention heads.
-        feed_forward: Hidden units of a block.
         registers: Number of learned tokens after the class token.
         scaled: Whether the tower is a DINOv2. Then its blocks have layer scales, and its first token is a class token.
         image: Pixels per side of the image.
@@ -51,20 +47,18 @@ class Tower:
 
     @property
     def patches(self) -> int:
-        """Number of patches of an image, each of which is a token."""
         return (self.image // self.patch) ** 2
 
     @property
     def prefix(self) -> int:
-        """Number of tokens before the patches: class token and registers."""
         return self.registers + self.scaled
 
 
+# by timm's name: DINOv2 ViT-L/14 with registers, and SigLIP So400m/14
 TOWERS = {
     "vit_large_patch14_reg4_dinov2.lvd142m": Tower(1024, 24, 16, 4096, registers=4, scaled=True),
     "vit_so400m_patch14_siglip_224": Tower(1152, 27, 16, 4304),
 }
-"""Shapes of OpenVLA's two towers, by timm's name: DINOv2 ViT-L/14 with registers, and SigLIP So400m/14."""
 
 
 @dataclass(frozen=True)
@@ -82,16 +76,13 @@ class Language:
 
     @property
     def key_value_heads(self) -> int:
-        """Number of heads of keys and values. Several query heads may share a head of keys and values."""
         return self.num_key_value_heads or self.num_attention_heads
 
     @property
     def channels(self) -> int:
-        """Number of channels of a head."""
         return self.hidden_size // self.num_attention_heads
 
     def cache_sizes(self, batch: int, capacity: int) -> tuple[int, int, int, int, int]:
-        """Return the first five arguments of `Cache`: layers, batch, heads of keys and values, capacity, channels."""
         return self.num_hidden_layers, batch, self.key_value_heads, capacity, self.channels
 
 
@@ -101,7 +92,6 @@ class Shape:
 
     Attributes:
         towers: Shapes of the two vision towers, in the order of the input channels.
-        language: Shape of the language model.
         padding: Number of unused rows at the end of the vocabulary.
         bins: Number of edges of the action bins.
     """
@@ -118,12 +108,10 @@ class Shape:
 
     @property
     def patches(self) -> int:
-        """Number of vision tokens in the prompt."""
         return self.towers[0].patches
 
 
 def read_shape(folder: Path) -> Shape:
-    """Read the shapes from a checkpoint's `config.json`."""
     path, value = folder / CONFIG, read_config(folder)
     text = value.get("text_config")
     if not isinstance(text, Mapping) or text.get("model_type", "llama") != "llama" or text.get("rope_scaling"):
@@ -139,7 +127,6 @@ def read_shape(folder: Path) -> Shape:
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """Return the content of a checkpoint's `config.json`."""
     path = folder / CONFIG
     if not path.is_file():
         raise CheckpointError(f"no {CONFIG} in {folder}: name the folder of a Hugging Face OpenVLA checkpoint")
@@ -157,8 +144,7 @@ class Bounds:
     Attributes:
         q01: 1st percentile of the actions.
         q99: 99th percentile of the actions.
-        mask: Whether each DoF is normalised with the percentiles. A gripper, for example, is not. None if all
-            DoFs are normalised.
+        mask: Whether each DoF is normalised with the percentiles. A gripper, for example, is not. None if all are.
     """
 
     q01: tuple[float, ...]
@@ -167,16 +153,10 @@ class Bounds:
 
 
 def read_statistics(folder: Path, name: str | None) -> tuple[str, Bounds]:
-    """Read the action statistics of a data set from a checkpoint.
+    """Return the name and the action statistics of a data set.
 
-    A fine-tuned checkpoint has them in `dataset_statistics.json`, any other in the field `norm_stats` of `config.json`.
-
-    Args:
-        folder: Folder of the checkpoint.
-        name: Name of the data set. If None, the checkpoint must have statistics of only one data set.
-
-    Returns:
-        The name of the data set and its statistics.
+    If `name` is None, the checkpoint must have only one. A fine-tuned checkpoint has them in `dataset_statistics.json`,
+    any other in the field `norm_stats` of `config.json`.
     """
     path = folder / STATISTICS
     statistics = read_json(path) if path.is_file() else read_config(folder).get("norm_stats")
@@ -195,12 +175,9 @@ def action_space(shape: Shape, bounds: Bounds, like: ActionSpace | None, control
     """Return the action space of a checkpoint.
 
     Args:
-        shape: Shape of the checkpoint.
-        bounds: Action statistics, which become `low` and `high` of the space. A DoF that `bounds.mask` excludes gets -1
-            and 1.
+        bounds: Become `low` and `high` of the space. A DoF that `bounds.mask` excludes gets -1 and 1.
         like: Action space of an environment, from which names, groups, strict DoFs and control rate are copied. If
-            None, the space has OpenVLA's seven DoFs.
-        control_hz: Control steps per second if `like` is None.
+            None, the space has OpenVLA's seven DoFs and the rate `control_hz`.
     """
     from kerv_cli.base.spaces import ActionSpace, Group
 

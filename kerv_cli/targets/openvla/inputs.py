@@ -39,11 +39,11 @@ class Normalisation:
     std: tuple[float, float, float]
 
 
+# published: ImageNet's (rounded to bfloat16) for DINOv2, and SigLIP's
 DEFAULTS = (
     Normalisation((0.484375, 0.455078125, 0.40625), (0.228515625, 0.2236328125, 0.224609375)),
     Normalisation((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)),
 )
-"""Published normalisations of the two towers: ImageNet's (rounded to bfloat16) for DINOv2, and SigLIP's."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,6 @@ class _Preprocessor:
 
 
 def read_normalisations(folder: Path) -> tuple[Normalisation, Normalisation]:
-    """Read the normalisation for each tower from `preprocessor_config.json`. Without that file return the defaults."""
     path = folder / PREPROCESSOR
     found = read(_Preprocessor, read_mapping(path) if path.is_file() else {}, str(path), tolerant=True)
     if found.image_resize_strategy != RESIZE:
@@ -75,11 +74,10 @@ def cropped(image: np.ndarray, size: int) -> np.ndarray:
 
 
 def as_in_libero(image: np.ndarray, size: int) -> np.ndarray:
-    """Prepare an image (h, w, 3) uint8 as OpenVLA's evaluation on LIBERO does before it crops. Return (size, size, 3).
+    """Prepare an image (h, w, 3) uint8 as OpenVLA's evaluation on LIBERO does before it crops.
 
-    This equals the function `resize_image` in OpenVLA's libero_utils. The image is first compressed as JPEG, as the
-    training images were, with TensorFlow's settings (quality 95, colour at half resolution). Then it is resized by
-    Lanczos with antialiasing.
+    Return (size, size, 3). This equals `resize_image` in OpenVLA's libero_utils: JPEG with TensorFlow's settings, as
+    the training images were, then Lanczos with antialiasing.
     """
     file = io.BytesIO()
     Image.fromarray(image).save(file, "JPEG", quality=95, subsampling="4:2:0")
@@ -92,18 +90,15 @@ def as_in_libero(image: np.ndarray, size: int) -> np.ndarray:
 def pixels_of(
     image: np.ndarray, shape: Shape, normalisations: Sequence[Normalisation], crop: bool, libero: bool = False
 ) -> Tensor:
-    """Prepare an image for both vision towers.
+    """Prepare an image (h, w, 3) uint8 for both vision towers.
 
     Args:
-        image: (h, w, 3) uint8.
-        shape: Shapes of the checkpoint.
-        normalisations: Normalisation of the pixels for each tower.
         crop: Whether to crop the image to the central 90 % of its area.
         libero: Whether to apply `as_in_libero` first.
 
     Returns:
         (1, 6, s, s) float32, s pixels per side: three channels normalised for the first tower, then three for the
-        second.
+            second.
     """
     parts = []
     for tower, normal in zip(shape.towers, normalisations, strict=True):
@@ -122,6 +117,7 @@ def pixels_of(
 
 TOKENIZER = "tokenizer.json"
 BEGIN, BOUNDARY = "<s>", "\u2581"
+# the instruction replaces `{}`; v0.1 checkpoints need `openvla_v01`
 PROMPTS = {
     "openvla": "In: What action should the robot take to {}?\nOut:",
     "openvla_v01": (
@@ -130,21 +126,12 @@ PROMPTS = {
         "ASSISTANT:"
     ),
 }
-"""Text of the prompt, by version. The instruction replaces `{}`. v0.1 checkpoints need `openvla_v01`."""
 
 
 class Prompter:
-    """Turns instructions into the token ids of a checkpoint's prompt."""
+    """Turns instructions into the token ids of a checkpoint's prompt, at most `limit`. `form` is a key of `PROMPTS`."""
 
     def __init__(self, folder: Path, shape: Shape, form: str, limit: int) -> None:
-        """Read the tokenizer.
-
-        Args:
-            folder: Folder of the checkpoint.
-            shape: Shapes of the checkpoint.
-            form: Version of the prompt, a key of `PROMPTS`.
-            limit: Maximum number of ids in a prompt.
-        """
         path = folder / TOKENIZER
         if not path.is_file():
             raise CheckpointError(f"no {TOKENIZER} in {folder}: copy the one that was published with the checkpoint")
@@ -165,7 +152,6 @@ class Prompter:
             )
 
     def ids(self, instruction: str) -> list[int]:
-        """Return the ids of the prompt for an instruction: begin of sequence, the text, a word boundary."""
         ids: list[Any] = self.tokenizer.encode(self.text.format(instruction.lower())).ids
         if ids[:1] != [self.begin]:
             ids = [self.begin, *ids]

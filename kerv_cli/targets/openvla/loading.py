@@ -34,7 +34,6 @@ class Shards:
     """The safetensors files of a checkpoint.
 
     Attributes:
-        folder: Folder of the checkpoint.
         tensors: Name of the file that holds each tensor, by the tensor's name.
         shapes: Shape of each tensor, by name.
     """
@@ -45,19 +44,15 @@ class Shards:
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Names of the files, in alphabetical order."""
         return tuple(sorted(set(self.tensors.values())))
 
     def sizes(self) -> dict[str, int]:
-        """Return the size of each file in bytes, by name."""
         return {name: (self.folder / name).stat().st_size for name in self.files}
 
     def hashes(self) -> dict[str, str]:
-        """Return the SHA-256 of each file, by name."""
         return {name: sha256_of(self.folder / name) for name in self.files}
 
     def items(self) -> Iterator[tuple[str, Tensor]]:
-        """Yield the name and the content of every tensor. The content is memory-mapped."""
         for file in self.files:
             with _open_tensors(self.folder / file) as handle:
                 for name in handle.keys():  # noqa: SIM118 - not a mapping
@@ -93,13 +88,6 @@ def open_shards(folder: Path) -> Shards:
 
 
 def check_layout(shapes: Mapping[str, Sizes], expected: Mapping[str, Sizes], where: Path) -> None:
-    """Check that a checkpoint has exactly the expected tensors.
-
-    Args:
-        shapes: Shape of each tensor in the checkpoint, by name.
-        expected: Shape of each expected tensor, by name.
-        where: Folder of the checkpoint, for the error message.
-    """
     missing, unknown = [n for n in expected if n not in shapes], [n for n in shapes if n not in expected]
     reshaped = [f"{n} {shapes[n]}, not {size}" for n, size in expected.items() if shapes.get(n, size) != size]
     wrong = []
@@ -112,7 +100,6 @@ def check_layout(shapes: Mapping[str, Sizes], expected: Mapping[str, Sizes], whe
 
 
 def layout(shape: Shape) -> dict[str, Sizes]:
-    """Return the name and shape of every tensor that is read from a checkpoint of this shape."""
     with torch.device("meta"):
         return sizes_of(OpenVLAModel(shape))
 
@@ -125,27 +112,17 @@ def is_unread(name: str, shape: Shape) -> bool:
 
 
 def sizes_of(module: nn.Module) -> dict[str, Sizes]:
-    """Return the name and shape of each tensor of a module."""
     return {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
 
 
 def open_checked(folder: Path, shape: Shape) -> Shards:
-    """Open the safetensors files in a folder, and check that they have the tensors of this shape."""
     shards = open_shards(folder)
     check_layout({n: s for n, s in shards.shapes.items() if not is_unread(n, shape)}, layout(shape), folder)
     return shards
 
 
 def load_model(folder: Path, shape: Shape, device: str, dtype: torch.dtype, int8: bool) -> OpenVLAModel:
-    """Load and freeze the model of a checkpoint.
-
-    Args:
-        folder: Folder of the checkpoint.
-        shape: Shapes of the checkpoint.
-        device: Device to load the model to.
-        dtype: Number format to convert the weights to.
-        int8: Whether to convert the layers of the language model to one byte per weight.
-    """
+    """Load and freeze the model of a checkpoint. With `int8`, the language model's layers take one byte per weight."""
     shards = open_checked(folder, shape)
     with torch.device("meta"):
         model = OpenVLAModel(shape)
@@ -159,11 +136,7 @@ def load_model(folder: Path, shape: Shape, device: str, dtype: torch.dtype, int8
 
 
 def check_finite(shards: Shards) -> int:
-    """Check that all weights are finite. This reads the whole checkpoint.
-
-    Returns:
-        The number of weights.
-    """
+    """Check that all weights are finite, which reads the whole checkpoint. Return the number of weights."""
     count = 0
     for name, tensor in shards.items():
         if not torch.isfinite(tensor).all():
@@ -173,11 +146,6 @@ def check_finite(shards: Shards) -> int:
 
 
 def digest_of(hashes: Mapping[str, str], settings: Mapping[str, Any]) -> str:
-    """Return one SHA-256 that identifies a model whose weights are in several files.
-
-    Args:
-        hashes: SHA-256 of each file, by name.
-        settings: Settings that change what the model computes.
-    """
+    """Return one SHA-256 for the files of a model and the settings that change what the model computes."""
     text = json.dumps({"files": dict(sorted(hashes.items())), "settings": dict(settings)}, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

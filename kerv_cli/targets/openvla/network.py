@@ -25,15 +25,9 @@ EPSILON = 1e-6  # of every layer norm
 
 
 def rotation(positions: Tensor, channels: int, theta: float, dtype: torch.dtype) -> Rotation:
-    """Return the cosines and sines (T, C) of the rotary embedding in half-split layout. They are computed in float32.
+    """Return the cosines and sines (T, C) at positions (T,) in half-split layout, computed in float32.
 
     In the first half of the channels the sines have the reversed sign, as `attention.rotate` requires.
-
-    Args:
-        positions: (T,) rotary positions.
-        channels: C, channels of a head.
-        theta: Base of the frequencies.
-        dtype: Number format of the result.
     """
     frequencies = theta ** (-torch.arange(0, channels, 2, device=positions.device, dtype=torch.float32) / channels)
     angles = positions[:, None].float() * frequencies
@@ -56,15 +50,6 @@ class LlamaAttention(nn.Module):
     def forward(
         self, x: Tensor, rotary: Rotation, mask: Tensor | None, cache: Tensor | None = None, slots: Slots = None
     ) -> Tensor:
-        """Return the attention's output (B, T, E).
-
-        Args:
-            x: (B, T, E) input.
-            rotary: Cosines and sines of the tokens' positions.
-            mask: Result of `attention_mask`. If None, attention is causal.
-            cache: (2, B, K, capacity, C) keys and values of this layer. None if there are no earlier tokens.
-            slots: Slots of the cache that the new keys and values are written to.
-        """
         q = rotate(self.q_proj(x).unflatten(-1, (self.heads, -1)).transpose(1, 2), *rotary)
         k = rotate(self.k_proj(x).unflatten(-1, (self.shared, -1)).transpose(1, 2), *rotary)
         v = self.v_proj(x).unflatten(-1, (self.shared, -1)).transpose(1, 2)
@@ -82,16 +67,13 @@ class LlamaPerceptron(nn.Module):
         self.down_proj = nn.Linear(hidden, width, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return the output (B, T, E) for x (B, T, E)."""
         return self.down_proj(F.silu(self.gate_proj(x)) * self.up_proj(x))
 
 
 class LlamaLayer(nn.Module):
     """One pre-norm decoder layer.
 
-    Args:
-        language: Shape of the language model.
-        normed: Whether there is a norm before the attention. The first layer of a public EAGLE drafter has none.
+    `normed=False` leaves out the norm before the attention, as public EAGLE drafters do.
     """
 
     def __init__(self, language: Language, normed: bool = True) -> None:
@@ -105,7 +87,7 @@ class LlamaLayer(nn.Module):
     def forward(
         self, x: Tensor, rotary: Rotation, mask: Tensor | None, cache: Tensor | None = None, slots: Slots = None
     ) -> Tensor:
-        """Return the layer's output (B, T, E) for x (B, T, E). `LlamaAttention.forward` explains the arguments."""
+        """Return the layer's output (B, T, E) for x (B, T, E). `cache` (2, B, K, capacity, C) is this layer's."""
         x = x + self.self_attn(self.input_layernorm(x), rotary, mask, cache, slots)
         return x + self.mlp(self.post_attention_layernorm(x))
 
@@ -113,16 +95,7 @@ class LlamaLayer(nn.Module):
 def run_layers(
     layers: nn.ModuleList, language: Language, x: Tensor, positions: Tensor, cache: Cache | None, mask: Tensor | None
 ) -> Tensor:
-    """Run all layers over T new tokens, and return the output (B, T, E) of the last layer.
-
-    Args:
-        layers: Layers of the class `LlamaLayer`.
-        language: Shape of the language model.
-        x: (B, T, E) embeddings of the new tokens.
-        positions: (T,) rotary positions of the new tokens.
-        cache: Keys and values of earlier tokens. This forward appends the new ones. None if there is no cache.
-        mask: Result of `attention_mask`. If None, attention is causal.
-    """
+    """Run the layers over T new tokens x (B, T, E) at positions (T,), and append their keys and values to the cache."""
     rotary = rotation(positions, language.channels, language.rope_theta, x.dtype)
     slots = cache.next_slots(x.shape[1]) if cache is not None else None
     for i, layer in enumerate(layers):
@@ -143,7 +116,6 @@ class LlamaModel(nn.Module):
         self.norm = nn.RMSNorm(language.hidden_size, eps=language.rms_norm_eps)
 
     def forward(self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: Seen = None) -> Tensor:
-        """Return the hidden states (B, T, E) of embeddings x (B, T, E). `Target.forward` explains the arguments."""
         mask = attention_mask(seen, x.shape[1], cache, x)
         return self.norm(run_layers(self.layers, self.language, x, positions, cache, mask))
 
@@ -158,7 +130,6 @@ class LanguageModel(nn.Module):
 
 
 def named(**layers: nn.Module) -> nn.Sequential:
-    """Return the layers in sequence. The keyword of a layer becomes part of the names of its weights."""
     return nn.Sequential(OrderedDict(layers))
 
 
@@ -172,7 +143,6 @@ class Attention(nn.Module):
         self.proj = nn.Linear(tower.width, tower.width)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return the attention's output (B, n, W) for x (B, n, W)."""
         batch, tokens, width = x.shape
         q, k, v = self.qkv(x).view(batch, tokens, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
         attended = F.scaled_dot_product_attention(q, k, v)
@@ -187,7 +157,6 @@ class LayerScale(nn.Module):
         self.scale_factor = nn.Parameter(torch.ones(width))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Multiply each channel of x (B, n, W) by its factor."""
         return x * self.scale_factor
 
 
@@ -206,7 +175,6 @@ class Block(nn.Module):
         self.ls1, self.ls2 = scale(), scale()
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return the block's output (B, n, W) for x (B, n, W)."""
         x = x + self.ls1(self.attn(self.norm1(x)))
         return x + self.ls2(self.mlp(self.norm2(x)))
 
@@ -225,10 +193,7 @@ class VisionTower(nn.Module):
         self.blocks = nn.ModuleList(Block(tower) for _ in range(tower.depth - 1))
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """Map normalised images (B, 3, h, w) to patch tokens (B, n, W).
-
-        Position embeddings are added to patches only, not to the class token and the registers.
-        """
+        """Map normalised images (B, 3, h, w) to patch tokens (B, n, W). Only patches get position embeddings."""
         x = self.patch_embed(pixels).flatten(2).transpose(1, 2) + self.pos_embed
         if self.prefix:
             front = torch.cat([self.cls_token, self.reg_token], 1).expand(len(x), -1, -1)
@@ -239,19 +204,17 @@ class VisionTower(nn.Module):
 
 
 class VisionBackbone(nn.Module):
-    """Both vision towers. Their outputs are concatenated."""
+    """Both vision towers. Images (B, 6, h, w) have three channels for each. Their outputs are concatenated."""
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
         self.featurizer, self.fused_featurizer = (VisionTower(tower) for tower in shape.towers)
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """Map images (B, 6, h, w), three channels for each tower, to patch tokens (B, n, sum of both widths)."""
         return torch.cat([self.featurizer(pixels[:, :3]), self.fused_featurizer(pixels[:, 3:])], -1)
 
 
 def projector(shape: Shape) -> nn.Sequential:
-    """Return the layers that map patch tokens (B, n, both towers' widths) to the language model's tokens (B, n, E)."""
     width, hidden = sum(tower.width for tower in shape.towers), shape.language.hidden_size
     first, second, third = nn.Linear(width, 4 * width), nn.Linear(4 * width, hidden), nn.Linear(hidden, hidden)
     return named(fc1=first, gelu1=nn.GELU(), fc2=second, gelu2=nn.GELU(), fc3=third)
@@ -281,24 +244,16 @@ class Int8Linear(nn.Module):
     scale: Tensor
 
     def __init__(self, weight: Tensor, dtype: torch.dtype) -> None:
-        """Round weights to int8. In each row, 127 stands for the row's largest absolute value.
-
-        Args:
-            weight: (outputs, inputs) floats.
-            dtype: Number format of the scales.
-        """
         super().__init__()
         scale = weight.float().abs().amax(1).clamp_min(1e-12) / 127
         self.register_buffer("weight", (weight.float() / scale[:, None]).round().to(torch.int8))
         self.register_buffer("scale", scale.to(dtype))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map inputs (…, inputs) to outputs (…, outputs)."""
         return F.linear(x, self.weight.to(x.dtype)) * self.scale
 
 
 def quantise(module: nn.Module) -> None:
-    """Replace every linear layer inside a module by an `Int8Linear`."""
     for name, child in module.named_children():
         if isinstance(child, nn.Linear):
             setattr(module, name, Int8Linear(child.weight.data, child.weight.dtype))

@@ -51,7 +51,6 @@ class OpenVLASettings:
         int8: Whether the language model's layers have one byte per weight.
         prompt_tokens: Longest prompt in tokens, without the vision patches.
         image_size: Pixels per side of a tower's image.
-        chunk: H, control steps per decode.
     """
 
     checkpoint: str
@@ -72,7 +71,6 @@ class OpenVLATarget:
     def __init__(
         self, settings: OpenVLASettings, description: TargetDescription, device: str, dtype: torch.dtype
     ) -> None:
-        """Load and freeze the checkpoint of `settings`. `build` explains the other arguments and the errors."""
         source = Path(settings.checkpoint)
         self.settings, self.actions, self.cameras = settings, description.actions, tuple(description.cameras)
         self.observation = description.observation
@@ -97,7 +95,6 @@ class OpenVLATarget:
         return torch.cat([prompt[:, self.segments[name]].mean(1) for name in ("vision", "instruction")], -1)
 
     def encode(self, observation: Observation) -> Tensor:
-        """Encode an observation as a prompt (1, P, E)."""
         camera = self.cameras[0]
         if camera not in observation.images:
             raise CheckpointError(f"the target sees camera '{camera}', whose image was not drawn")
@@ -112,43 +109,25 @@ class OpenVLATarget:
         return self.model.language_model.model.embed_tokens(ids)
 
     def embed(self, tokens: Tensor) -> Tensor:
-        """Return the embeddings (B, T, E) of action tokens (B, T) int64."""
         return self.model.language_model.model.embed_tokens(self.shape.vocabulary - 1 - tokens)
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
-        """Return an empty key/value cache.
-
-        Args:
-            batch: Number of sequences.
-            capacity: Maximum number of tokens.
-            fixed: Whether every forward attends to all slots, so that all shapes are fixed. If None, only on CUDA.
-        """
         fixed = self.action_rows.is_cuda if fixed is None else fixed
         return Cache(*self.shape.language.cache_sizes(batch, capacity), self.action_rows, fixed)
 
     def forward(self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: Seen = None) -> Tensor:
-        """Return the hidden states (B, T, E) of embeddings x (B, T, E). `Target.forward` explains the arguments."""
         return self.model.language_model.model(x, positions, cache, seen)
 
     def head(self, hidden: Tensor) -> Tensor:
-        """Return the logits (..., V) of the action tokens for hidden states (..., E)."""
+        """Return the logits (..., V) of the action tokens only."""
         return F.linear(hidden, self.action_rows)
 
 
 def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> OpenVLATarget:
-    """Load and freeze an OpenVLA target.
-
-    Args:
-        folder: Folder of the target, for error messages. The weights are in the checkpoint's own folder.
-        description: The content of the target's `target.json`.
-        device: Device to load the target to.
-        dtype: Number format to convert the weights to.
-    """
     return OpenVLATarget(read_settings(folder, description), description, device, dtype)
 
 
 def read_settings(folder: Path, description: TargetDescription) -> OpenVLASettings:
-    """Return the settings in a target's description."""
     path = str(folder / "target.json")
     if len(description.cameras) != 1:
         raise CheckpointError(f"{path} names {len(description.cameras)} cameras: OpenVLA sees one")
@@ -156,10 +135,7 @@ def read_settings(folder: Path, description: TargetDescription) -> OpenVLASettin
 
 
 def check_weights(folder: Path, description: TargetDescription) -> None:
-    """Check that the checkpoint's files still have the names and sizes that they had when the target was built.
-
-    The files are not hashed, because 15 GB would take too long.
-    """
+    """Check the names and sizes of the checkpoint's files. Hashing 15 GB would take too long."""
     settings = read_settings(folder, description)
     source = Path(settings.checkpoint)
     if not source.is_dir() or open_shards(source).sizes() != settings.files:
@@ -173,10 +149,9 @@ NO_STATE = ObservationSpace(proprioception=(), state=0, places=(), centre=(0.0, 
 
 
 def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
-    """Make a target from an OpenVLA checkpoint: check all its weights, and write `target.json`.
+    """Make a target from an OpenVLA checkpoint, after checking all its weights.
 
-    Returns:
-        The target's folder, and numbers to print, each with its name, such as the number of parameters.
+    Return its folder, and numbers to print by name.
     """
     if not settings.checkpoint:
         raise UsageError("checkpoint=DIR: name the folder of a Hugging Face OpenVLA checkpoint")
