@@ -177,6 +177,7 @@ def test_two_servers_are_two_settings_that_take_turns_and_both_times_are_in_the_
     assert table.loc["fast", "speedup_low"] > 1
     assert table.loc[["slow", "fast"], "success"].tolist() == [1, 1]
     np.testing.assert_allclose(table["server_ms"], 1.5)
+    assert table["unverified_share"].isna().all()
     assert table.loc["real", "felt_latency_ms"] > 0
     assert "of it the" in " ".join(told("report", "study=two", f"results={tmp_path}", "--all").split())
 

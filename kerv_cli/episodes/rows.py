@@ -68,7 +68,8 @@ def _executed(episode: EpisodeRecord, count: Callable[[DecodeRecord, int, int], 
 
 
 def _values(decode: DecodeRecord, first: int, end: int) -> int:
-    return (end - first) * decode.actions.shape[1]
+    # what a server verified is unknown
+    return 0 if decode.served else (end - first) * decode.actions.shape[1]
 
 
 _EPISODE: Fields = {
