@@ -24,9 +24,10 @@ from kerv_cli.catalogue.entries import RunEntry, find_run, find_runs, matching, 
 from kerv_cli.episodes.resolve import resolve, resolve_rollout, study_name
 from kerv_cli.lab.command import chosen_store
 from kerv_cli.lab.database import opened
+from kerv_cli.lab.follow import run
 from kerv_cli.lab.store import ROLLOUT
 from kerv_cli.lab.store import Study as StoredStudy
-from kerv_cli.lab.study import plan, run
+from kerv_cli.lab.study import check, plan
 from kerv_cli.report.measures import Row
 from kerv_cli.report.report import report as write_reports
 from kerv_cli.report.tables import load_study as load_data
@@ -112,9 +113,9 @@ def rollout(*overrides: str, grid: bool = False, **settings: object) -> Study:
     with chosen_store(as_overrides(*overrides, **settings)) as typed:
         resolved = resolve_rollout(typed, grid)
         command = ["rollout", *(["-m"] if grid else []), *typed]
-        planned = plan(resolved, opened(resolved.first.results), command, ROLLOUT)
-        run(planned, save=save_recording)
-    return Study(planned)
+        planned = plan(resolved, check(resolved), opened(resolved.first.results), command, ROLLOUT)
+        run(planned, write=save_recording)
+    return Study(planned.study)
 
 
 def sweep(study: str | Path, *overrides: str, **settings: object) -> Study:
@@ -135,13 +136,14 @@ def sweep(study: str | Path, *overrides: str, **settings: object) -> Study:
     """
     with chosen_store(as_overrides(f"study={study}", *overrides, **settings)) as typed:
         resolved = resolve(typed)
-        planned = plan(resolved, opened(resolved.first.results), ["sweep", *typed])
-        failed = run(planned, save=save_recording).failed
+        database, command = opened(resolved.first.results), ["sweep", *typed]
+        planned = plan(resolved, check(resolved), database, command)
+        failed = run(planned, write=save_recording).failed
     if failed:
         one, lost = failed[0].episodes[0], sum(len(failure.episodes) for failure in failed)
-        of_all = f"{lost} of {len(planned.episodes)} episodes failed"
+        of_all = f"{lost} of {len(planned.study.episodes)} episodes failed"
         raise KervError(f"{of_all}, {one.setting.label} on {one.task}: {failed[0].reason}")
-    return Study(planned)
+    return Study(planned.study)
 
 
 def load_study(name: str, results: str | Path = "results", store: str = "") -> Study:

@@ -22,11 +22,12 @@ from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
 from kerv_cli.episodes.identity import Setting, without
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database, opened
+from kerv_cli.lab.follow import Outcome, begun, follow
 from kerv_cli.lab.plan import all_episodes
-from kerv_cli.lab.runs import Run
 from kerv_cli.lab.store import Study
-from kerv_cli.lab.study import Outcome, run_blocks
+from kerv_cli.lab.study import Plan, plan_study, save
 from kerv_cli.lab.work import OnEvent, Prepare, RunEpisode
+from kerv_cli.lab.workers import workers
 from kerv_cli.worlds import settled
 from kerv_cli.worlds.metaworld.spec import SPEC
 
@@ -81,7 +82,7 @@ def study_of(
     block: int = 5,
     **about: Any,
 ) -> Study:
-    """A study of these settings, by label; `ar` is the baseline. `plan_study` puts it into a database."""
+    """A study of these settings, by label; `ar` is the baseline. `planned` puts it into a database."""
     made = tuple(
         Setting(
             label,
@@ -97,9 +98,9 @@ def study_of(
     return Study(NOWHERE, name, "sweep", made, episodes, block=block, **about)
 
 
-def plan_study(database: Database, study: Study, *arguments: Any, **options: Any) -> Study:
-    """The study in a database, with what that has of it and what is missing."""
-    return replace(study, database=database).plan(*arguments, **options)
+def planned(database: Database, study: Study, *arguments: Any, **options: Any) -> Plan:
+    """What a database has of a study, and what is missing."""
+    return plan_study(replace(study, database=database), *arguments, **options)
 
 
 def threshold_study(
@@ -120,14 +121,14 @@ def swept(
 ) -> tuple[Study, Outcome]:
     """Runs what the database of a results folder lacks of a study."""
     command = ["sweep", f"study={study.name}"]
-    study = plan_study(opened(results), study, rerun, runtime=runtime, command=command)
+    plan = planned(opened(results), study, rerun, runtime=runtime, command=command)
     prepare = prepare or episodes_of
-    total = len(study.to_run)
     # variables of a process are set for its worker processes alone: two threads that sweep would restore each other's
-    in_others = study.runtime.workers > 1 or study.runtime.executor != "local"
-    pretended = pretending(prepare) if in_others else contextlib.nullcontext()
-    with Run(study.database, study.kind, study.name, command, total, alone=False) as record, pretended:
-        return study, run_blocks(study, prepare, record, on_event)
+    in_others = plan.is_elsewhere or plan.runtime.workers > 1
+    with begun(plan) as record, pretending(prepare) if in_others else contextlib.nullcontext():
+        save(plan, record.id)
+        with workers(plan, record.id) as tend:
+            return plan.study, follow(plan, record, tend, prepare, on_event)
 
 
 @contextlib.contextmanager

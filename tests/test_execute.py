@@ -1,5 +1,6 @@
-"""Running a study: resume, isolation of failures, workers that are killed or stopped, sweeps at once, Slurm."""
+"""Running a study: resume, isolation of failures, workers that are killed or stopped, sweeps at once."""
 
+import contextlib
 import os
 import re
 import signal
@@ -8,7 +9,6 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,12 +17,14 @@ from command import refusal, told
 from conftest import python, raising, refused, until
 from examples.point_mass import SPEC as POINT_MASS
 from studies_synthetic import (
+    brisk,
     count_calls,
     episode,
     episodes_of,
     misbehave,
     part,
-    plan_study,
+    planned,
+    pretending,
     settings_of,
     study_of,
     swept,
@@ -30,27 +32,29 @@ from studies_synthetic import (
     unhurried,
 )
 
-from kerv_cli.base.errors import KervError, StorageError, UsageError
+from kerv_cli.base.errors import Interrupted, KervError, StorageError, UsageError
 from kerv_cli.base.registry import _PARTS, parts
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.cli.common import progress_bar
 from kerv_cli.cli.studies import event_printer
-from kerv_cli.lab.database import EPISODES, QUEUE, WANTED, Database, clock, opened
+from kerv_cli.lab.database import EPISODES, UNFINISHED, WANTED, WORKERS, Database, clock, opened
+from kerv_cli.lab.follow import TimeLeft, begun
 from kerv_cli.lab.plan import blocks_of
+from kerv_cli.lab.presence import Presence
+from kerv_cli.lab.queue import ClaimLost, Queue
 from kerv_cli.lab.store import Study
-from kerv_cli.lab.study import TimeLeft
+from kerv_cli.lab.study import save
 from kerv_cli.lab.work import (
     BlockStarted,
-    ClaimLost,
+    Counted,
     EpisodeEnd,
     Event,
     Preparing,
-    Queue,
     SettingFailed,
     Started,
     work,
 )
-from kerv_cli.lab.workers import LocalWorkers, disturbances, gpus_in_turn
+from kerv_cli.lab.workers import LocalWorkers, disturbances, gpus_in_turn, workers
 from kerv_cli.report.report import further_of
 from kerv_cli.report.tables import load_study
 from kerv_cli.worlds import EnvironmentPart
@@ -64,13 +68,13 @@ TWO = threshold_study(["reach-v3", "push-v3"])
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     monkeypatch.setattr("kerv_cli.lab.work.POLL_SECONDS", 0.05)
-    monkeypatch.setattr("kerv_cli.lab.study.FOLLOW_SECONDS", 0.1)
+    monkeypatch.setattr("kerv_cli.lab.follow.FOLLOW_SECONDS", 0.1)
 
 
 def queued(database: Database) -> int:
-    """Return how many blocks wait or run."""
+    """Return how many episodes wait or run."""
     with database.reading() as connection:
-        return int(connection.scalar(sa.select(sa.func.count()).select_from(QUEUE)) or 0)
+        return int(connection.scalar(sa.select(sa.func.count()).select_from(WANTED).where(UNFINISHED)) or 0)
 
 
 def episodes(database: Database) -> int:
@@ -78,10 +82,36 @@ def episodes(database: Database) -> int:
         return int(connection.scalar(sa.select(sa.func.count()).select_from(EPISODES)) or 0)
 
 
-def running(database: Database) -> list[object]:
-    """Return what the queue says of the episodes that run."""
+def running(database: Database) -> list[int]:
+    """Return the seeds of the episodes that run."""
     with database.reading() as connection:
-        return list(connection.scalars(sa.select(QUEUE.c.running)))
+        return list(connection.scalars(sa.select(WANTED.c.seed).where(UNFINISHED, WANTED.c.attempts > 0)))
+
+
+def silence(database: Database, seconds: float = 60.0) -> None:
+    """Let all heartbeats be so old."""
+    with database.writing() as connection:
+        connection.execute(sa.update(WORKERS).values(heartbeat=clock(connection) - seconds))
+
+
+def waiting(database: Database, study: Study) -> Study:
+    """Plan a study and save the plan. Nobody runs it yet."""
+    plan = planned(database, study)
+    save(plan)
+    return plan.study
+
+
+@pytest.fixture
+def present():
+    """Return the queue of a new worker that lives until the end of the test."""
+    with contextlib.ExitStack() as stack:
+        yield lambda store: Queue(store, stack.enter_context(Presence(store.database)).worker)
+
+
+def ran(store: Study, prepare=episodes_of, on_event=lambda event: None) -> None:
+    """Run what a study waits for, in a worker of its own."""
+    with Presence(store.database) as presence:
+        work(Queue(store, presence.worker), prepare, on_event)
 
 
 def errors(database: Database) -> list[str]:
@@ -121,7 +151,7 @@ def test_each_episode_is_committed_when_it_ends(database):
 
     store, _ = swept(database.results, STUDY, on_event=on_event)
     assert told == [(number, 16) for number in range(1, 17)]
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(Interrupted, match="of 32 episodes of threshold are kept: run the same command to resume"):
         swept(database.results, TWO, raising(KeyboardInterrupt(), "ar", [100_002]))
     assert store.counts()[0] in range(24, 28)  # two seeds of four settings, and some of the third
     assert queued(database) == 0
@@ -140,7 +170,9 @@ def test_a_setting_that_raises_is_dropped_from_its_block_alone(database):
     assert failure.reason.startswith("RuntimeError: the gripper fell off (conftest.py:")
     assert ["fell off" in text for text in errors(database)] == [True, True]
     assert sum(isinstance(event, EpisodeEnd) for event in events) == 14
-    assert [event for event in events if isinstance(event, SettingFailed)] == [failure]
+    (event,) = [event for event in events if isinstance(event, SettingFailed)]
+    assert event.reason == failure.reason
+    assert [one.key for one in event.episodes] == [one.key for one in failure.episodes]
     _, outcome = swept(database.results, STUDY)
     assert (len(outcome.done), outcome.failed, errors(database)) == (2, [], [])
     assert store.counts() == (16, 16)
@@ -160,7 +192,7 @@ def test_an_error_of_kerv_is_told_in_its_own_words(database):
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_study_that_is_deleted_while_it_runs_says_so(tmp_path, workers):
     def remove(event):
-        if isinstance(event, EpisodeEnd):
+        if isinstance(event, Counted) and sum(event.left.values()) < 16:
             Study(opened(tmp_path), "threshold").remove()
 
     with pytest.raises(KervError, match="threshold was deleted"):
@@ -169,62 +201,130 @@ def test_a_study_that_is_deleted_while_it_runs_says_so(tmp_path, workers):
     assert (outcome.failed, store.counts(), queued(store.database)) == ([], (16, 16), 0)
 
 
-def test_a_sweep_goes_on_when_another_plans_fewer_episodes(database):
-    """The study is what was planned last. What the longer sweep runs is kept, and found by the next one."""
-    fewer = threshold_study(["reach-v3"], episodes=1)
+def test_a_study_removed_elsewhere_takes_no_episode_away(database):
+    """Between plan and save, or while another study runs: its episodes count, or run again."""
+    other = threshold_study(["reach-v3"], name="other")
+    swept(database.results, other)
+    plan = planned(database, STUDY)
+    assert not plan.missing
+    Study(database, "other").remove()
+    save(plan)
+    ran(plan.study)
+    assert (plan.study.counts(), errors(database)) == ((16, 16), [])
+    swept(database.results, other)
 
-    def plan_fewer(event):
+    def remove(event):
         if isinstance(event, EpisodeEnd):
-            replace(fewer, database=database).save()
+            Study(database, "other").remove()
 
-    store, outcome = swept(database.results, STUDY, on_event=plan_fewer)
-    assert (len(outcome.done), outcome.failed, store.counts()[1]) == (16, [], 4)
+    _, outcome = swept(database.results, TWO, on_event=remove)
+    assert (len(outcome.done), len(outcome.reused), outcome.failed) == (16, 16, [])
+
+
+def test_a_row_number_is_never_given_again(database):
+    """A plan that links to episodes of a study that is removed finds none of another's in their place."""
+    swept(database.results, STUDY)
+    plan = planned(database, STUDY)
+    Study(database, "threshold").remove()
+    swept(database.results, study_of({"ar": settings_of("ar"), "late": settings_of("jacobi")}, ["push-v3"], "another"))
+    save(plan)
+    assert (plan.study.counts(), Study(database, "another").counts()) == ((0, 16), (8, 8))
+
+
+@pytest.mark.parametrize("others", [
+    threshold_study(["reach-v3"], episodes=1), threshold_study(["reach-v3"], episodes=6),
+    threshold_study(["reach-v3", "push-v3"], episodes=2), threshold_study(["reach-v3"], radii=(3, 9, 15)),
+])  # fmt: skip
+def test_a_second_sweep_while_one_runs_takes_nothing_away(others, database):
+    """With fewer, more and other episodes: both end with a table of all that they planned."""
+    both = []
+    with ThreadPoolExecutor(1) as pool:
+
+        def on_event(event):
+            if isinstance(event, EpisodeEnd) and not both:
+                both.append(pool.submit(swept, database.results, others))
+                until(lambda: Study(database, "threshold").counts()[1] >= len(others.episodes))
+                time.sleep(0.2)
+
+        store, one = swept(database.results, STUDY, on_event=on_event)
+        _, other = both[0].result()
+    for study, outcome in ((STUDY, one), (others, other)):
+        assert outcome.failed == []
+        assert len(outcome.done) + len(outcome.reused) == len(study.episodes)
+    keys = {(each.setting.label, each.task, each.seed) for each in (*STUDY.episodes, *others.episodes)}
+    assert store.counts() == (len(keys), len(keys))
+    assert (episodes(database), queued(database)) == (len(keys), 0)
+
+
+def test_other_settings_under_a_label_are_refused_while_the_study_runs(database):
+    changed = study_of({"ar": settings_of("ar"), "naive_sd": settings_of("spec_vla", 9)}, ["reach-v3"])
+
+    def on_event(event):
+        if isinstance(event, EpisodeEnd):
+            with refused("threshold is running", "other settings of naive_sd", error=UsageError):
+                swept(database.results, changed)
+
+    store, _ = swept(database.results, STUDY, on_event=on_event)
+    assert store.counts() == (16, 16)
+    assert swept(database.results, changed)[1].failed == []
+    assert store.counts() == (8, 8)
+
+
+def test_a_rerun_that_is_killed_is_resumed_without_rerun(database):
+    """What it has run is kept, and stored episodes do not come back."""
+    swept(database.results, STUDY)
+    first = set(Study(database, "threshold").frame()["episode"])
+    with python(SWEEP, database.results, "killed_at_the_third", 1, 1, "all", "reach-v3") as process:
+        process.join(60)
+        assert process.exitcode == -signal.SIGKILL
+    store = Study(database, "threshold")
+    there = store.counts()[0]
+    assert 0 < there < 16
+    plan = planned(database, STUDY)
+    assert (len(plan.existing), set(plan.missing.values())) == (there, {"rerun=all"})
     _, outcome = swept(database.results, STUDY)
-    assert (outcome.done, len(outcome.reused), store.counts()) == ([], 16, (16, 16))
+    assert (len(outcome.done), len(outcome.reused)) == (16 - there, there)
+    assert first.isdisjoint(store.frame()["episode"])
 
 
 SWEEP = """
 import os
 import sys
 import studies_synthetic as s
-from kerv_cli.lab import study, work
-work.POLL_SECONDS, study.FOLLOW_SECONDS = 0.05, 0.1
-study = s.threshold_study(["reach-v3", "push-v3"], episodes=2, radii=(3,))
-number, processes = int(sys.argv[3]), int(sys.argv[4])
+from kerv_cli.lab import follow, work
+work.POLL_SECONDS, follow.FOLLOW_SECONDS = 0.05, 0.1
+number, processes, rerun, *tasks = int(sys.argv[3]), int(sys.argv[4]), *sys.argv[5:]
+study = s.threshold_study(tasks or ["reach-v3", "push-v3"], **({} if tasks else {"episodes": 2, "radii": (3,)}))
 children = []
 while len(children) < processes - 1 and (not children or children[-1]):
     children.append(os.fork())
-s.swept(sys.argv[1], study, getattr(s, sys.argv[2]), runtime=s.RuntimeSettings(workers=number))
+s.swept(sys.argv[1], study, getattr(s, sys.argv[2]), rerun, s.RuntimeSettings(workers=number))
 if all(children):
     assert [os.waitpid(child, 0)[1] for child in children] == [0] * len(children)
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_workers_of_a_killed_sweep_end_and_its_claims_are_taken_over(tmp_path, monkeypatch):
-    monkeypatch.setattr("kerv_cli.lab.work.LAPSE_SECONDS", 1.0)
+def test_workers_of_a_killed_sweep_end_and_the_next_one_begins_at_once(tmp_path):
+    """Its lock is free: nobody waits for its heartbeat to lapse."""
     store = Study(opened(tmp_path), "threshold")
-    with python(SWEEP, tmp_path, "slow_elsewhere", 2, 1) as process:  # the first task at once, the other in a minute
-        until(lambda: store.counts()[0] == 6)
-        until(lambda: queued(store.database) == 1)
+    with python(SWEEP, tmp_path, "slow_elsewhere", 2, 1, "never") as process:  # the second task takes a minute
+        until(lambda: store.counts()[0] == 6, 120.0)
+        until(lambda: running(store.database))
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
         assert children
         process.kill()
     until(lambda: not any(Path(f"/proc/{child}").exists() for child in children), 5.0)
-    assert (store.counts(), queued(store.database)) == ((6, 12), 1)
+    assert (store.counts(), queued(store.database)) == ((6, 12), 6)
+    began = time.monotonic()
     _, outcome = swept(tmp_path, threshold_study(["reach-v3", "push-v3"], episodes=2, radii=(3,)))
+    assert time.monotonic() - began < 20.0
     assert (len(outcome.reused), len(outcome.done), queued(store.database)) == (6, 6, 0)
-
-
-def waiting(database: Database, study: Study, run: str = "run") -> Study:
-    """Plan a study and queue its blocks, which nobody runs yet."""
-    study = plan_study(database, study)
-    Queue(study, run).fill()
-    return study
 
 
 def test_an_episode_takes_one_transaction(tmp_path, monkeypatch):
     """Nor is SQLite's log flushed to the disk after each."""
+    monkeypatch.setattr("kerv_cli.lab.presence.BEAT_SECONDS", 60.0)
     store, begun = waiting(Database(tmp_path), STUDY), []
     writing = Database.writing
     monkeypatch.setattr(Database, "writing", lambda self: begun.append(1) or writing(self))
@@ -233,108 +333,100 @@ def test_an_episode_takes_one_transaction(tmp_path, monkeypatch):
         if isinstance(event, EpisodeEnd):
             assert (tmp_path / "kerv.db-wal").exists()
 
-    work(Queue(store), episodes_of, on_event)
+    ran(store, episodes_of, on_event)
     assert store.counts() == (16, 16)
-    # two claims, of which the second removes the block; four settings are prepared, and the first episode begins
-    assert len(begun) <= 16 + 2 + 4 + 1
+    # the worker comes and goes; two claims; four settings are prepared, and the first episode begins
+    assert len(begun) <= 16 + 2 + 2 + 4 + 1
 
 
-def test_a_worker_whose_claim_lapsed_unnoticed_runs_the_block_anew(database):
-    store, lapsed = waiting(database, STUDY), []
+def test_a_worker_that_was_silent_keeps_its_block_if_nobody_took_it(database):
+    store, ended = waiting(database, STUDY), []
 
     def lapse(event: Event) -> None:
-        if isinstance(event, EpisodeEnd) and not lapsed:
-            lapsed.append(event)
-            with database.writing() as connection:
-                connection.execute(sa.update(QUEUE).values(heartbeat=0.0))
+        if isinstance(event, EpisodeEnd):
+            ended.append(event)
+            silence(database)
 
-    work(Queue(store), episodes_of, lapse)
-    assert (store.counts(), queued(database), episodes(database)) == ((16, 16), 0, 16)
+    ran(store, episodes_of, lapse)
+    assert (store.counts(), queued(database), episodes(database), len(ended)) == ((16, 16), 0, 16, 16)
 
 
 @pytest.mark.parametrize(("silent", "is_held"), [(25.0, True), (35.0, False)])
-def test_a_claim_lasts_as_long_as_its_heartbeat(database, silent, is_held, monkeypatch):
+def test_a_claim_lasts_as_long_as_its_heartbeat(database, silent, is_held, monkeypatch, present):
     """By the database's clock: the clocks of two machines may differ by an hour."""
     store = waiting(database, STUDY)
-    first, second = Queue(store), Queue(store)
+    first, second = present(store), present(store)
     claim = first.claim()
     assert second.claim() is None
-    with database.writing() as connection:
-        connection.execute(sa.update(QUEUE).values(heartbeat=clock(connection) - silent))
+    silence(database, silent)
     monkeypatch.setattr("time.time", lambda: 3600.0)
     assert (second.claim() is None) == is_held
     if is_held:
-        first.begin(claim, claim.block.episodes[0])
+        first.begin(claim.block.episodes[0])
     else:
         with pytest.raises(ClaimLost):
-            first.begin(claim, claim.block.episodes[0])
+            first.begin(claim.block.episodes[0])
 
 
-def test_a_claim_that_has_lapsed_does_not_come_back(database):
-    """Another study has the same episodes. Its worker begins them when the first one falls silent."""
-    first = Queue(waiting(database, STUDY, "one"))
-    second = Queue(waiting(database, threshold_study(["reach-v3"], name="other"), "two"))
-    claim = first.claim()
-    assert claim is not None
-    assert second.claim() is None
-    with database.writing() as connection:
-        connection.execute(sa.update(QUEUE).where(QUEUE.c.run == "one").values(heartbeat=clock(connection) - 40.0))
-    assert second.claim() is not None
-    with pytest.raises(ClaimLost):
-        first.begin(claim, claim.block.episodes[0])
-
-
-def test_no_two_workers_run_an_episode_that_two_studies_share(database):
+def test_no_two_workers_run_an_episode_that_two_studies_share(database, present):
     """Nor does one study's block wait for another's that shares nothing with it."""
-    one = waiting(database, STUDY, "one")
-    other = waiting(database, threshold_study(["reach-v3", "push-v3"], radii=(3,), name="other"), "other")
-    first, second = Queue(one), Queue(other)
-    assert first.claim() is not None
-    claim = second.claim()
-    assert claim is not None
-    assert claim.block.task == "push-v3"
-    assert Queue(other).claim() is None
-    with database.writing() as connection:
-        connection.execute(sa.update(QUEUE).where(QUEUE.c.run == "one").values(worker=None))
-    work(Queue(one), episodes_of)
-    again = Queue(other).claim()
+    one = waiting(database, STUDY)
+    other = waiting(database, threshold_study(["reach-v3", "push-v3"], radii=(3,), name="other"))
+    with Presence(database) as presence:
+        assert Queue(one, presence.worker).claim() is not None
+        claim = present(other).claim()
+        assert claim is not None
+        assert claim.block.task == "push-v3"
+        assert present(other).claim() is None
+    ran(one)
+    again = present(other).claim()
     assert again is not None
-    assert (len(again.existing), again.block.episodes) == (12, ())
+    assert (again.block.episodes, other.counts()) == ((), (12, 24))
 
 
 STOPS = """
 import sys
 import studies_synthetic as s
-from kerv_cli.lab import work
+from kerv_cli.lab import presence, work
 from kerv_cli.lab.database import opened
+from kerv_cli.lab.queue import Queue
 from kerv_cli.lab.store import Study
-work.LAPSE_SECONDS, work.BEAT_SECONDS = 1.0, 0.3
-work.work(work.Queue(Study(opened(sys.argv[1]), "threshold")), s.stops)
+presence.LAPSE_SECONDS, presence.BEAT_SECONDS = 1.0, 0.3
+with presence.Presence(opened(sys.argv[1])) as here:
+    work.work(Queue(Study(opened(sys.argv[1]), "threshold"), here.worker), s.stops)
 """
 
 
-def test_a_worker_that_was_stopped_loses_its_block_and_writes_nothing_twice(database, monkeypatch):
-    monkeypatch.setattr("kerv_cli.lab.work.LAPSE_SECONDS", 1.0)
+@pytest.mark.parametrize("is_taken", [True, False])
+def test_a_worker_that_was_stopped_writes_nothing_twice(database, monkeypatch, is_taken):
+    monkeypatch.setattr("kerv_cli.lab.presence.LAPSE_SECONDS", 1.0)
     store = waiting(database, STUDY)
-    (stopping,) = (one for one in STUDY.episodes if (one.setting.label, one.seed) == ("ar", 100_002))
     with python(STOPS, database.results) as process:
-        until(lambda: running(database) == [list(stopping.key)])
-        assert 0 < store.counts()[0] < 16
-        work(Queue(store), episodes_of)
-        assert (store.counts(), queued(database)) == ((16, 16), 0)
+        until(lambda: running(database) == [100_002])
+        until(lambda: Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[0] == "T")
+        there = store.counts()[0]
+        assert 0 < there < 16
+        if is_taken:
+            ran(store)
+            assert (store.counts(), queued(database)) == ((16, 16), 0)
+        else:
+            time.sleep(1.5)
         os.kill(process.pid, signal.SIGCONT)
         process.join(30)
         assert process.exitcode == 0
-    assert episodes(database) == 16
+    assert (episodes(database), store.counts(), queued(database)) == (16, (16, 16), 0)
 
 
 CREW = """
 import os
 import sys
 import studies_synthetic as s
-from kerv_cli.lab import database, work
-from kerv_cli.lab.store import Study
+from kerv_cli.lab import database, follow, work
 from kerv_cli.lab.database import Database, opened
+from kerv_cli.lab.presence import Presence, bury
+from kerv_cli.lab.queue import Queue
+from kerv_cli.lab.store import Study
+from kerv_cli.lab.study import save
 
 work.POLL_SECONDS = 0.01
 results, prepare = sys.argv[1], getattr(s, sys.argv[2])
@@ -349,20 +441,21 @@ def parted(function, *arguments, **options):
     os._exit(0)
 
 
-def begun(store):
-    return parted(lambda: work.work(work.Queue(Study(opened(results), store.name)), prepare))
+def ran(name):
+    with Presence(opened(results)) as here:
+        work.work(Queue(Study(opened(results), name), here.worker), prepare)
 
 
 def crew(store, number):
     "Keep so many workers at work until every block has ended; return how many died."
-    workers, died = [begun(store) for _ in range(number)], 0
+    workers, died = [parted(ran, store.name) for _ in range(number)], 0
     while workers:
         child, status = os.wait()
         workers.remove(child)
         if status:
             died += 1
-            assert work.Queue(store).lapse(child)
-            workers.append(begun(store))
+            bury(store.database)
+            workers.append(parted(ran, store.name))
     return died
 """
 MATRIX = """
@@ -373,7 +466,7 @@ for workers in (1, 2, 4):
             setting.settings["seed"] = 100_000 + 100 * block + 10 * workers
         episodes = s.all_episodes(study.settings, ["reach-v3"], block)
         study = s.replace(study, episodes=episodes)
-        work.Queue(s.plan_study(opened(results), study), "run").fill()
+        save(s.planned(opened(results), study))
         died = crew(Study(opened(results), study.name), workers)
         print(study.name, died)
 """
@@ -385,16 +478,15 @@ def test_any_number_of_workers_run_each_episode_once_though_some_are_killed(data
         process.join(120)
         assert process.exitcode == 0
     assert (episodes(database), queued(database), errors(database)) == (9 * 10, 0, [])
-    for workers in (1, 2, 4):
+    for number in (1, 2, 4):
         for block in (1, 2, 5):
-            assert Study(database, f"s{workers}{block}").counts() == (10, 10)
+            assert Study(database, f"s{number}{block}").counts() == (10, 10)
 
 
 AT_ONCE = """
 study = s.threshold_study(["reach-v3", "push-v3"], episodes=4, radii=(3,), block=2)
-work.Queue(s.plan_study(opened(results), study), "earlier").fill()
-store = Study(opened(results), study.name)
-children = [begun(store) for _ in range(3)] + [parted(s.swept, results, study, prepare) for _ in range(2)]
+save(s.planned(opened(results), study))
+children = [parted(ran, study.name) for _ in range(3)] + [parted(s.swept, results, study, prepare) for _ in range(2)]
 assert [os.waitpid(child, 0)[1] for child in children] == [0] * 5
 """
 
@@ -408,7 +500,7 @@ def test_two_sweeps_and_three_workers_at_once_run_each_episode_once(database):
 
 
 def test_sweeps_at_once_run_each_episode_once(database):
-    with python(SWEEP, database.results, "unhurried", 1, 4) as process:
+    with python(SWEEP, database.results, "unhurried", 1, 4, "never") as process:
         process.join(60)
         assert process.exitcode == 0
     assert episodes(database) == 12
@@ -416,21 +508,12 @@ def test_sweeps_at_once_run_each_episode_once(database):
     assert queued(database) == 0
 
 
-def test_a_sweep_that_begins_in_the_middle_of_another_runs_nothing_twice(database):
-    """Its blocks are smaller: some of their episodes were there when it was planned."""
-    outcomes = []
-    with ThreadPoolExecutor(1) as pool:
-
-        def on_event(event):
-            if isinstance(event, EpisodeEnd) and not outcomes and Study(database, "threshold").counts()[0] == 5:
-                outcomes.append(pool.submit(swept, database.results, STUDY))
-                until(lambda: plan_study(database, STUDY).existing)
-                time.sleep(0.3)
-
-        swept(database.results, STUDY, on_event=on_event)
-        _, outcome = outcomes[0].result()
-    assert episodes(database) == 16
-    assert (len(outcome.done), len(outcome.reused)) == (0, 16)
+def test_a_block_that_failures_have_emptied_does_not_come_back(database):
+    """All of its settings fail in the first worker; the second finds nothing to do."""
+    store, seen = waiting(database, STUDY), []
+    ran(store, raising(RuntimeError("the gripper fell off")))
+    ran(store, episodes_of, seen.append)
+    assert (seen, queued(database), len(errors(database))) == ([], 0, 16)
 
 
 def in_order() -> Study:
@@ -491,39 +574,41 @@ def test_a_worker_counts_its_episodes_without_a_total(capsys):
 IN_ORDER = """
 from test_execute import in_order
 study = in_order()
-work.Queue(s.plan_study(opened(results), study), "run").fill()
-assert crew(Study(opened(results), study.name), 1) == 2
+save(s.planned(opened(results), study))
+assert crew(Study(opened(results), study.name), 1) == 3
 """
 
 
 def test_episodes_whose_order_counts_run_whole_again_when_their_process_dies(database):
-    """A setting in which two workers die fails in the block."""
+    """A setting in which three workers die fails in the block."""
     with python(CREW + IN_ORDER, database.results, "killed_at_the_third") as process:
         process.join(60)
         assert process.exitcode == 0
     store = Study(database, "threshold")
     assert store.counts() == (2 + 4, 8)
-    assert errors(database) == ["two workers died in this episode\n"] * 2
+    assert errors(database) == ["3 workers died in this episode\n"] * 2
     frame = store.frame().query("label == 'heisd'")
     assert (len(frame), frame["block"].nunique()) == (4, 1)
-    assert {one.setting.label for one in plan_study(database, in_order()).missing} == {"ar"}
+    assert {one.setting.label for one in planned(database, in_order()).missing} == {"ar"}
 
 
-def test_estimates_say_what_they_rest_on(database):
-    def planned(workers):
-        return TimeLeft(plan_study(database, TWO, runtime=RuntimeSettings(workers=workers)), 10.0)
+def test_estimates_say_what_they_rest_on(database, monkeypatch):
+    def left(workers):
+        return TimeLeft(planned(database, TWO, runtime=RuntimeSettings(workers=workers)), 10.0)
 
-    left = planned(1)
-    assert (left.seconds, "guess" in left.source) == (32 * 10.0, True)
-    one, other = (next(one for one in TWO.episodes if one.setting is setting) for setting in TWO.settings[:2])
-    left.see(EpisodeEnd(one, True, 2.0))
-    assert left.seconds == 31 * 2.0, "an episode that ended corrects the guess"
-    left.see(EpisodeEnd(other, True, 8.0))
-    assert left.seconds == 7 * 2.0 + 7 * 8.0 + 16 * 5.0, "each setting has its own mean"
+    assert (left(1).seconds, "guess" in left(1).source) == (32 * 10.0, True)
     store, _ = swept(database.results, threshold_study(["reach-v3"], radii=()))
     wall = store.frame().groupby("label")["wall_seconds"].mean()
-    assert planned(2).seconds == pytest.approx((4 * wall.sum() + 16 * wall.mean()) / 2)
-    assert planned(2).source == "measured on 8 stored episodes"
+    estimate = left(2)
+    assert estimate.seconds == pytest.approx((4 * wall.sum() + 16 * wall.mean()) / 2)
+    assert estimate.source == "measured on 8 stored episodes"
+    waits = {setting.work: 4 if number < 2 else 8 for number, setting in enumerate(TWO.settings)}
+    began = time.monotonic()
+    monkeypatch.setattr("time.monotonic", lambda: began + 6.0)
+    estimate.see(Counted(waits))
+    assert estimate.seconds == left(2).seconds, "nothing has ended"
+    estimate.see(Counted({work: number / 4 for work, number in waits.items()}))
+    assert estimate.seconds == pytest.approx(2.0, rel=0.1), "a quarter is left after 6 s"
 
 
 def test_progress_without_a_terminal_is_plain_lines(tmp_path, capsys):
@@ -542,10 +627,10 @@ def test_progress_without_a_terminal_is_plain_lines(tmp_path, capsys):
 
 def test_progress_begins_before_the_first_episode(tmp_path, capsys):
     study = threshold_study(["reach-v3"], episodes=26)
-    planned = plan_study(Database(tmp_path), study)
-    (block, *_), setting = planned.blocks, study.settings[0]
+    plan = planned(Database(tmp_path), study)
+    (block, *_), setting = plan.blocks, study.settings[0]
     with progress_bar("episodes", has_estimate=True) as show:
-        on_event = event_printer(show, TimeLeft(planned, 60.0))
+        on_event = event_printer(show, TimeLeft(plan, 60.0))
         for event in (Started(104, 0), BlockStarted(block), Preparing(setting, 1, 4)):
             on_event(event)
         for one in study.episodes:
@@ -559,7 +644,7 @@ def test_progress_begins_before_the_first_episode(tmp_path, capsys):
     each = [line for line in lines if ", seed 1" in line]
     assert each[0].startswith("1/104 ")
     assert len(each) == 100, "a line per episode, though the study has more than 100"
-    assert any(re.fullmatch(r"episodes 52/104, about 104 s left, .* in turn", line) for line in lines)
+    assert any(re.fullmatch(r"episodes 52/104, about .* left, .* in turn", line) for line in lines)
 
 
 @pytest.mark.parametrize(("load", "lines"), [(2.0, 0), (3.0, 1)])
@@ -577,16 +662,16 @@ def test_only_the_guilty_settings_fail(tmp_path):
     """One setting kills its process, one raises; the rest of their blocks still takes turns."""
     study = threshold_study(["reach-v3"], episodes=2, radii=(1, 3, 5), block=1)
     for setting in study.settings:
-        setting.settings["runtime"]["threads"] = 3  # type: ignore[index]
+        setting.settings["runtime"] |= {"threads": 3, "workers": 2}  # type: ignore[index]
     store, outcome = swept(tmp_path, study, misbehave, runtime=RuntimeSettings(workers=2))
     reasons = {failure.episodes[0].setting.label: failure.reason for failure in outcome.failed}
-    assert reasons["spec_vla r=1"] == "two workers died in this episode"
+    assert reasons["spec_vla r=1"] == "3 workers died in this episode"
     assert reasons["spec_vla r=5"].startswith("Odd: 1 and 2")
     assert sum(len(failure.episodes) for failure in outcome.failed) == 3
     done = 3 * 2 + 1
     assert len(outcome.done) == done
     table = store.frame()
-    assert (set(table["executor"]), set(table["workers"])) == ({"local"}, {2})
+    assert set(table["workers"]) == {2}
     assert table["run"].nunique() == 1
     assert set(table["wall_seconds"]) == {3.0}  # OMP_NUM_THREADS
     assert queued(store.database) == 0
@@ -619,7 +704,7 @@ def test_each_local_worker_sees_one_gpu(visible, device, seen, tmp_path, monkeyp
     store = waiting(opened(tmp_path), STUDY)
     script = f'echo "$CUDA_VISIBLE_DEVICES" > {tmp_path}/gpu$$; sleep 60'
     monkeypatch.setattr(sys, "executable", str(shell(tmp_path, "python", script)))
-    with LocalWorkers(Queue(store), 3, 1, gpus_in_turn(device)):
+    with LocalWorkers(store.database, store.name, "", 3, dict(os.environ), gpus_in_turn(device)):
         until(lambda: sum(path.stat().st_size > 0 for path in tmp_path.glob("gpu*")) == 3)
     found = [path.read_text().strip() for path in tmp_path.glob("gpu*")]
     assert {one: found.count(one) for one in found} == seen
@@ -632,7 +717,7 @@ def test_a_plan_warns_of_workers_that_disturb_each_others_times(tmp_path, monkey
         settings = settings_of("ar")
         settings.runtime.device, settings.rollout.batch = device, batch
         runtime = RuntimeSettings(workers=workers)
-        return disturbances(plan_study(database, study_of({"ar": settings}, ["reach-v3"]), runtime=runtime))
+        return disturbances(planned(database, study_of({"ar": settings}, ["reach-v3"]), runtime=runtime))
 
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
     assert warnings(1) == warnings(2, "cuda") == warnings(2, batch=16) == []
@@ -654,22 +739,43 @@ def test_a_database_that_does_not_answer_is_asked_again_for_two_minutes(tmp_path
             if len(locks) > 1:
                 threading.Timer(0.5, locks[-1].close).start()
 
-    monkeypatch.setattr("kerv_cli.lab.work.PATIENCE_SECONDS", 0.3)
+    monkeypatch.setattr("kerv_cli.lab.queue.PATIENCE_SECONDS", 0.3)
     with refused("locked", "finished episodes are kept", error=StorageError):
-        work(Queue(store), episodes_of, lock)
+        ran(store, episodes_of, lock)
     locks[-1].close()
     assert store.counts() == (4, 16)
-    monkeypatch.setattr("kerv_cli.lab.work.PATIENCE_SECONDS", 20.0)
-    with store.database.writing() as connection:  # the block could not be freed
-        connection.execute(sa.update(QUEUE).values(heartbeat=0.0))
-    work(Queue(store), episodes_of, lock)
+    monkeypatch.setattr("kerv_cli.lab.queue.PATIENCE_SECONDS", 20.0)
+    silence(store.database)  # the block could not be freed
+    ran(store, episodes_of, lock)
     assert (len(locks), store.counts(), episodes(store.database)) == (2, (16, 16), 16)
 
 
 @pytest.mark.parametrize(("override", "says"), [
-    ("runtime.executor=slrum", "did you mean slurm"), ("runtime.workers=0", "runtime.workers=0"),
-    ("runtime.executor_options.minutes=long", "minutes"), ("runtime.executor_options.partitoin=x", "partition"),
-    ("runtime.detach=true", "runtime.executor=slurm"),
+    ("runtime.executor=slurm", "runtime.executor"), ("runtime.workers=-1", "runtime.workers=-1"),
 ])  # fmt: skip
-def test_a_wrong_executor_is_refused_in_one_line(override, says, tmp_path):
+def test_a_wrong_way_to_start_workers_is_refused_in_one_line(override, says, tmp_path):
     assert says in refusal("sweep", "study=demo", override, f"results={tmp_path}", code=2)
+    with refused("runtime.launch: echo no queue; exit 3 failed: no queue"):
+        swept(tmp_path, STUDY, runtime=RuntimeSettings(launch="echo no queue; exit 3"))
+    assert queued(opened(tmp_path)) == 0
+
+
+def test_a_command_starts_workers_and_the_sweep_follows_them(tmp_path):
+    """As with any engine that runs `kerv work`. Its line is typed in a shell."""
+    launch = f"{sys.executable} -m kerv_cli $(echo '{{command}}' | cut -d' ' -f2-) 2>{tmp_path}/said &"
+    with pretending(brisk):
+        store, outcome = swept(tmp_path, STUDY, brisk, runtime=RuntimeSettings(launch=launch))
+    assert (len(outcome.done), store.counts()) == (16, (16, 16)), (tmp_path / "said").read_text()
+
+
+def test_a_sweep_without_workers_says_how_to_start_some(tmp_path):
+    """And Ctrl-C lets workers elsewhere end: nothing is asked for any more."""
+    said, store = [], Study(opened(tmp_path), "threshold")
+    plan = planned(opened(tmp_path), STUDY, runtime=RuntimeSettings(workers=0))
+    with pytest.raises(Interrupted), begun(plan) as record:  # noqa: PT012
+        save(plan, record.id)
+        with workers(plan, record.id, said.append):
+            assert queued(store.database) == 16
+            raise KeyboardInterrupt
+    assert said == [f"start workers, as many as you like: kerv work study=threshold results={tmp_path}"]
+    assert (queued(store.database), store.counts()) == (0, (0, 16))

@@ -8,15 +8,15 @@ from typing import Any
 import pandas as pd
 import pytest
 from conftest import raising
-from studies_synthetic import IDENTITY, part, plan_study, settings_of, study_of, swept, threshold_study
+from studies_synthetic import IDENTITY, part, planned, settings_of, study_of, swept, threshold_study
 
-from kerv_cli.base.errors import UsageError
+from kerv_cli.base.errors import Interrupted, UsageError
 from kerv_cli.episodes import identity
 from kerv_cli.episodes.identity import ENGINE, Setting, hash_of, without
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.plan import Block, all_episodes, blocks_of
-from kerv_cli.lab.runs import interrupted
 from kerv_cli.lab.store import Study
+from kerv_cli.lab.study import plan_study
 from kerv_cli.report.summary import not_in_turn
 from kerv_cli.report.tables import load_study
 
@@ -74,8 +74,8 @@ def test_what_determines_a_result_is_another_episode():
     }.items():  # fmt: skip
         assert work(changed(path, value)) != work(settings_of("spec_vla", 9)), path
     for path, value in {
-        "seed": 100_001, "episodes": 5, "runtime.workers": 2, "runtime.executor": "slurm",
-        "runtime.executor_options": {"partition": "p"}, "results": "elsewhere", "record": -1, "record_size": 480,
+        "seed": 100_001, "episodes": 5, "runtime.workers": 2, "runtime.launch": "sbatch {command}",
+        "results": "elsewhere", "record": -1, "record_size": 480,
         "method": "other_name", "policy.target": "same-weights-elsewhere", "task": ["push-v3"],
     }.items():  # fmt: skip
         assert work(changed(path, value)) == work(settings_of("spec_vla", 9)), path
@@ -131,7 +131,7 @@ def test_more_episodes_run_only_the_new_seeds_in_turn(database):
     swept(database.results, threshold_study(TASKS, episodes=3, radii=(3,)))
     study = threshold_study(TASKS, episodes=5, radii=(3,))
     new = {(label, task): ([100_003, 100_004], "new seeds") for label in study.labels for task in TASKS}
-    assert to_run(plan_study(database, study)) == new
+    assert to_run(planned(database, study)) == new
     store, outcome = swept(database.results, study)
     assert (len(outcome.done), len(outcome.reused)) == (12, 18)
     row = table_of(store).loc["spec_vla r=3"]
@@ -160,14 +160,14 @@ def test_another_study_runs_only_what_it_does_not_share(database):
     store, _ = swept(database.results, threshold_study(["reach-v3"]))
     settings = {"renamed": settings_of("spec_vla", 3), "ar": settings_of("ar"), "new": settings_of("spec_vla", 15)}
     study = study_of(settings, ["reach-v3"], "other")
-    assert to_run(plan_study(database, study)) == {("new", "reach-v3"): (list(range(100_000, 100_004)), "new setting")}
+    assert to_run(planned(database, study)) == {("new", "reach-v3"): (list(range(100_000, 100_004)), "new setting")}
     other, outcome = swept(database.results, study)
     assert len(outcome.reused) == 8
     store.remove()
     assert not store.exists
     assert other.counts() == (12, 12)
     assert len(table_of(other)) == 3
-    assert len(to_run(plan_study(database, threshold_study(["reach-v3"])))) == 2  # only naive_sd and r=9 are gone
+    assert len(to_run(planned(database, threshold_study(["reach-v3"])))) == 2  # only naive_sd and r=9 are gone
 
 
 @on_sqlite
@@ -193,27 +193,22 @@ def test_a_rerun_keeps_the_older_measurement(database):
     study = threshold_study(["reach-v3"])
     store, _ = swept(database.results, study)
     first = set(store.frame()["episode"])
-    assert why(plan_study(database, study, "all")) == {"rerun=all"}
+    assert why(planned(database, study, "all")) == {"rerun=all"}
     swept(database.results, study, rerun="all")
     assert first.isdisjoint(store.frame()["episode"])
-    newest = {row.id for row in plan_study(database, study).existing.values()}
+    newest = set(planned(database, study).existing.values())
     assert newest == set(store.frame()["episode"])
 
 
-def test_an_interrupted_rerun_goes_on(database):
+def test_an_interrupted_rerun_goes_on_without_rerun(database):
+    """The same command with rerun=all begins anew."""
     study = threshold_study(["reach-v3"])
     swept(database.results, study)
-    with database.writing() as connection:  # not in the second in which the next one begins
-        connection.exec_driver_sql("UPDATE runs SET started = '2020-01-01T00:00:00.000+00:00'")
-        connection.exec_driver_sql("UPDATE blocks SET started = '2020-01-01T00:00:00.000+00:00'")
-    words = ["sweep", f"study={study.name}"]
-    assert interrupted(database, "sweep", words) is None
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(Interrupted, match="run the same command without rerun=all to resume"):
         swept(database.results, study, raising(KeyboardInterrupt(), seeds=[100_002]), rerun="all")
-    begun = interrupted(database, "sweep", words)
-    assert begun
     rest = {(label, "reach-v3"): ([100_002, 100_003], "rerun=all") for label in study.labels}
-    assert to_run(plan_study(database, study, "all", begun.started)) == rest
+    assert to_run(planned(database, study)) == rest
+    assert len(planned(database, study, "all").missing) == 16
 
 
 @on_sqlite
@@ -222,7 +217,7 @@ def test_reasons_name_what_changed(database, monkeypatch):
 
     def reason(settings, task="reach-v3", weights=IDENTITY):
         setting = Setting("spec_vla r=3", (), without(asdict(settings), {"task"}), weights)
-        split = Study(database, "threshold", "sweep", (setting,), all_episodes([setting], [task])).plan()
+        split = plan_study(Study(database, "threshold", "sweep", (setting,), all_episodes([setting], [task])))
         return next(iter(split.missing.values()), "")
 
     same = settings_of("spec_vla", 3)
@@ -247,8 +242,8 @@ def test_what_depends_on_the_order_of_episodes_is_reused_whole(database):
         return study_of({"ar": settings_of("ar", episodes=episodes), "heisd": settings}, ["reach-v3"])
 
     swept(database.results, study(2))
-    assert not plan_study(database, study(2)).missing
-    split = plan_study(database, study(4))
+    assert not planned(database, study(2)).missing
+    split = planned(database, study(4))
     assert {key: sorted(seeds) for key, (seeds, _) in to_run(split).items()} == {
         ("ar", "reach-v3"): [100_002, 100_003],
         ("heisd", "reach-v3"): [100_000, 100_001, 100_002, 100_003],

@@ -17,7 +17,7 @@ import sqlalchemy as sa
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
-from studies_synthetic import part, plan_study, points_of, settings_of, still_episode, study_of, swept, threshold_study
+from studies_synthetic import part, planned, points_of, settings_of, still_episode, study_of, swept, threshold_study
 
 from kerv_cli.engine.record import DecodeRecord, Round
 from kerv_cli.episodes.identity import Setting
@@ -26,6 +26,7 @@ from kerv_cli.lab import database as tables
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.plan import Episode
 from kerv_cli.lab.store import Study
+from kerv_cli.lab.study import save
 from kerv_cli.lab.work import RunEpisode
 from kerv_cli.report.measures import MACRO, MICRO, Result, columns_of
 from kerv_cli.report.plots import acceptance_figure, colours_of, curves_figure, lines_of, png, study_figures
@@ -330,7 +331,7 @@ def results(tmp_path_factory):
     folder = tmp_path_factory.mktemp("results")
     study = threshold_study(["reach-v3", "push-v3", "door-open-v3"], episodes=3)
     swept(folder, replace(study, episodes=study.episodes[:-3]))
-    plan_study(opened(folder), study).save()
+    save(planned(opened(folder), study))
     return folder
 
 

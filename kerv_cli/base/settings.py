@@ -36,27 +36,14 @@ def part(kind: str, name: str = "none", help: str = "") -> Any:
 
 
 @dataclass
-class SlurmOptions:
-    """What a sweep asks of Slurm for each of its workers."""
-
-    partition: str = setting("", "partition; empty: the cluster's default")
-    minutes: int = number(120, 1, 100_000, help="time limit of a worker; when it ends, the sweep starts another")
-    memory_gb: int = number(8, 1, 100_000, help="memory of a worker, GB")
-    gpus: int = number(0, 0, 1024, help="GPUs of a worker")
-    setup: list[str] = setting([], "shell lines before the worker starts, such as 'module load cuda'")
-
-
-@dataclass
 class RuntimeSettings:
     """Device, number format and parallelism of a process."""
 
     device: str = setting("cpu", "cpu, cuda or auto")
     dtype: str = choice("float32", "float32", "bfloat16", "float16", help="number format of the models")
     threads: int = number(1, 1, 256, help="torch's threads in each process")
-    executor: str = choice("local", "local", "slurm", help="sweeps: where workers run: on this machine or on a cluster")
-    workers: int = number(1, 1, 4096, help="sweeps: number of processes that run episodes at the same time")
-    detach: bool = setting(False, "executor=slurm: end when the workers are submitted; the same sweep follows them")
-    executor_options: SlurmOptions = setting(SlurmOptions, "executor=slurm: what to ask of Slurm for each worker")
+    workers: int = number(1, 0, 4096, help="sweeps: number of processes that run episodes at once; 0: start none")
+    launch: str = setting("", "sweeps: shell command that starts workers elsewhere; {command} is `kerv work …`")
 
 
 REPLACE = "replace what another command has made under this name"

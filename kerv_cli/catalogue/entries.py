@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from operator import attrgetter, itemgetter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import sqlalchemy as sa
 
@@ -28,9 +28,12 @@ from kerv_cli.base.registry import ArtifactPart
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.lab.database import ABOUT, EPISODES, SETTINGS, STUDIES, WANTED, Database
-from kerv_cli.lab.plan import ALL
+from kerv_cli.lab.plan import ALL, NEVER
 from kerv_cli.lab.runs import COMPLETE, RUNNING, RunRow, forget, interrupted, run_rows, time_left
 from kerv_cli.lab.store import ROLLOUT, SWEEP, Study
+
+if TYPE_CHECKING:
+    from kerv_cli.lab.study import Plan
 
 LOG, WEIGHTS = "log.csv", "model.safetensors"
 """Names of the files that a training writes: the log of its validations, and the weights."""
@@ -421,7 +424,7 @@ def remove(run: RunEntry, database: Database) -> None:
     shutil.rmtree(gone, ignore_errors=True)
 
 
-def plan_of(run: RunEntry, database: Database) -> Study:
+def plan_of(run: RunEntry, database: Database) -> Plan:
     """Return a study that runs a sweep or rollout again.
 
     If an earlier repetition was interrupted, the study consists of the rest of that repetition.
@@ -430,7 +433,7 @@ def plan_of(run: RunEntry, database: Database) -> Study:
         run: The sweep or rollout to repeat.
         database: The database that has the sweep or rollout.
     """
-    from kerv_cli.lab.study import new_name  # imports torch, which listing runs does not need
+    from kerv_cli.lab.study import new_name, plan_study  # imports torch, which listing runs does not need
     from kerv_cli.lab.work import checked
 
     results, study = str(database.results), store_of(run, database).load()
@@ -448,4 +451,4 @@ def plan_of(run: RunEntry, database: Database) -> Study:
         numbers, name = itertools.count(2), f"{run.id}-again"
         while Study(database, name).exists:
             name = f"{run.id}-again{next(numbers)}"
-    return replace(study, name=name).plan(ALL, row.started if row else "", command=command)
+    return plan_study(replace(study, name=name), NEVER if row else ALL, command=command)

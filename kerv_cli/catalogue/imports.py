@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import os
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -16,15 +17,17 @@ import sqlalchemy as sa
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import regular, write_folder
 from kerv_cli.episodes.identity import Setting
-from kerv_cli.episodes.rows import DECODE_SCHEMA
+from kerv_cli.episodes.rows import DECODE_SCHEMA, seconds_blob, table_blob
 from kerv_cli.lab import database as tables
 from kerv_cli.lab.database import FILE, MEASURES, SCHEMA, Database, file_url, measures_in, other_schema
 from kerv_cli.lab.plan import Episode
-from kerv_cli.lab.store import ImportedEpisode, Study, stored_settings
+from kerv_cli.lab.runs import Run
+from kerv_cli.lab.store import Study, stored_settings, write_episode
 from kerv_cli.worlds.demos.files import foreign_table
 
 _DAMAGE = (sa.exc.SQLAlchemyError, sqlite3.Error, pa.ArrowException, OSError, ValueError, KeyError, TypeError,
            AttributeError)  # fmt: skip
+_BLOCK = ("about", "run", "seeds")
 _FURTHER = ("order", "started")
 _ROW = (*map(attrgetter("name"), MEASURES), *_FURTHER)
 
@@ -32,6 +35,16 @@ MOST_STEPS = 20_000_000
 """Instructions that SQLite may execute per connection (about 1 s), plus STEPS_PER_BYTE for each byte of the file."""
 STEPS_PER_BYTE = 20
 _EVERY = 10_000
+
+
+@dataclass(frozen=True)
+class ImportedEpisode:
+    """An episode of another database: its columns of the table `episodes`, its decodes, and the row of its block."""
+
+    episode: Episode
+    row: Mapping[str, Any]
+    decodes: pa.Table
+    block: Mapping[str, Any]
 
 
 Found: TypeAlias = tuple[Study, Iterator[ImportedEpisode], tuple[str, ...]]
@@ -64,7 +77,7 @@ def import_databases(database: Database, files: Sequence[Path], name: str = "") 
                 if study.counts()[0]:
                     notes.append(f"{study.name} exists and was left out: 'kerv runs rm {study.name}' removes it")
                 else:
-                    study.add(episodes, command or ("runs", "import", str(file)))
+                    _add(study, episodes, command or ("runs", "import", str(file)))
                     names.append(study.name)
     return names, notes
 
@@ -157,7 +170,7 @@ def _stored_episodes(connection: sa.Connection, path: Path, settings: dict[int, 
     stored = [*measures_in(connection), *tables.EPISODES.c[_FURTHER]]
     measures = [column.label(f"row.{name}") for name, column in zip(_ROW, stored, strict=True)]
     query = (
-        sa.select(tables.WANTED, *measures, *of_block, decodes.c.parquet)
+        sa.select(*tables.WANTED.c["setting_id", "task", "seed"], *measures, *of_block, decodes.c.parquet)
         .select_from(tables.WANTED.join(tables.EPISODES).join(tables.BLOCKS))
         .join(decodes, decodes.c.episode_id == tables.EPISODES.c.id)
         .where(tables.WANTED.c.setting_id.in_(settings))
@@ -168,8 +181,31 @@ def _stored_episodes(connection: sa.Connection, path: Path, settings: dict[int, 
             episode = Episode(settings[row["setting_id"]], row["task"], row["seed"])
             values = {name: row[f"row.{name}"] for name in _ROW}
             decoded = foreign_table(row["parquet"]).cast(DECODE_SCHEMA)
-            block = row["block"], row["about"], row["run"], row["seeds"]
-            yield ImportedEpisode(episode, values, decoded, *block)
+            block = {"started": values["started"], "id": row["block"]} | {name: row[name] for name in _BLOCK}
+            yield ImportedEpisode(episode, values, decoded, block)
+
+
+def _add(study: Study, episodes: Iterable[ImportedEpisode], command: Sequence[str]) -> None:
+    """Write a study and its episodes, which were run elsewhere, in one transaction.
+
+    Args:
+        study: The study.
+        episodes: The episodes that were run, with their results.
+        command: Command-line arguments (without `kerv`) of the import.
+    """
+    from kerv_cli.lab.study import Plan, save_in  # imports torch
+
+    with Run(study.database, study.kind, study.name, command) as record, study.database.writing() as connection:
+        number = save_in(connection, Plan(study, {}, {}), record.id)
+        of_label = sa.select(tables.SETTINGS.c.label, tables.SETTINGS.c.id).where(tables.SETTINGS.c.study_id == number)
+        ids: dict[str, int] = dict(connection.execute(of_label).all())
+        for one in episodes:
+            row = {**one.row, "decode_seconds": seconds_blob(one.decodes["seconds"].to_pylist())}
+            stored = write_episode(connection, one.episode.key, one.block, row, table_blob(one.decodes))
+            key = {"setting_id": ids[one.episode.setting.label], "task": one.episode.task, "seed": one.episode.seed}
+            connection.execute(sa.update(tables.WANTED).filter_by(**key).values(episode_id=stored))
+        waiting = sa.update(tables.WANTED).where(tables.WANTED.c.study_id == number, tables.UNFINISHED)
+        connection.execute(waiting.values(block=None))
 
 
 @contextlib.contextmanager
@@ -189,7 +225,7 @@ def export_database(study: Study, folder: Path) -> Path:
         with study.database.reading() as connection:
             row = connection.execute(sa.select(tables.STUDIES).where(tables.STUDIES.c.name == study.name)).one()
             copied, episodes, command = _stored(connection, folder / FILE, row, copy)
-            copied.add(episodes, command)
+            _add(copied, episodes, command)
         copy.close()
 
     if folder.is_dir() and set(os.listdir(folder)) - {FILE}:

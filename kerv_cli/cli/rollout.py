@@ -11,7 +11,7 @@ import typer
 from kerv_cli.base.durations import about, count
 from kerv_cli.cli.command import Cfg, command
 from kerv_cli.cli.common import AsJson, ShowPlan, console, end_with_json, print_table, results_word, settings_yaml
-from kerv_cli.cli.studies import SECONDS_PER_EPISODE, planned_study, run_study
+from kerv_cli.cli.studies import SECONDS_PER_EPISODE, announce, check_installed, run_plan
 from kerv_cli.episodes.settings import RolloutSettings
 
 Many = Annotated[
@@ -40,12 +40,23 @@ def rollout(
     if cfg:
         typer.echo("---\n".join(map(settings_yaml, resolved.settings.values())), nl=False)
         return
-    planned = planned_study(resolved, ["rollout", *(["-m"] if multirun else []), *overrides], is_rollout=True)
-    if plan:
-        from kerv_cli.lab.study import TimeLeft
+    announce(resolved, is_rollout=True)
+    from kerv_cli.lab.database import opened
+    from kerv_cli.lab.follow import TimeLeft
+    from kerv_cli.lab.store import ROLLOUT
+    from kerv_cli.lab.study import check
+    from kerv_cli.lab.study import plan as plan_rollout
 
+    words = ["rollout", *(["-m"] if multirun else []), *overrides]
+    planned = plan_rollout(resolved, check(resolved), opened(resolved.first.results), words, ROLLOUT)
+    check_installed(planned, resolved)
+    study = planned.study
+    if planned.existing:
+        total = len(study.episodes)
+        typer.echo(f"resuming {study.name}: {len(planned.existing)} of {total} episodes are there", err=True)
+    if plan:
         names = ", ".join(f"{label}{stress_text(asdict(settings))}" for label, settings in resolved.settings.items())
-        total, tasks, left = len(planned.episodes), resolved.tasks, TimeLeft(planned, SECONDS_PER_EPISODE)
+        total, tasks, left = len(study.episodes), resolved.tasks, TimeLeft(planned, SECONDS_PER_EPISODE)
         if as_json:
             end_with_json({"settings": list(resolved.settings), "tasks": tasks, "episodes": total,
                            "seconds": left.seconds, "source": left.source})  # fmt: skip
@@ -56,18 +67,18 @@ def rollout(
     from kerv_cli.report.summary import SummaryTable, setting_tables
     from kerv_cli.report.tables import load_study
 
-    run_study(planned)
-    data, name, recordings = load_study(planned), planned.name, planned.recordings
+    run_plan(planned)
+    data, name, recordings = load_study(study), study.name, study.recordings
     if as_json:
-        end_with_json({"run": name, "folder": planned.root, "settings": [row.columns() for row in data.results],
+        end_with_json({"run": name, "folder": study.root, "settings": [row.columns() for row in data.results],
                        "tasks": [row.columns() for row in data.task_results], "recordings": recordings})  # fmt: skip
-    if len(planned.labels) > 1:
+    if len(study.labels) > 1:
         console().print(SummaryTable(data.results))
     else:
         for table in setting_tables(data):
             print_table(*table)
     show = f"kerv runs show {name}{results_word(overrides)}"
-    typer.echo(f"run {name} in {planned.root}; its settings and figures: {show}")
+    typer.echo(f"run {name} in {study.root}; its settings and figures: {show}")
     if recordings:
         first = shlex.quote(str(recordings[0]))
         typer.echo(f"{count(len(recordings), 'recording')}; open one with: kerv view {first}")

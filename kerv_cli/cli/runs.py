@@ -221,14 +221,14 @@ def rerun(
         made = f", which '{run.command_line}' makes" if run.command else ""
         raise UsageError(f"{run.id} is of the kind {run.kind}{made}: only sweeps and rollouts are repeated")
     from kerv_cli.catalogue.entries import plan_of, store_of
-    from kerv_cli.cli.studies import run_study
+    from kerv_cli.cli.studies import run_plan
     from kerv_cli.report.compare import same_tokens
 
     planned = plan_of(run, database)
-    name = planned.name
+    name = planned.study.name
     if plan:
         end_with_plan(f"{run.id} again as {name}: {count(len(planned.to_run), 'episode')}", as_json)
-    failed = run_study(planned).failed
+    failed = run_plan(planned).failed
     if failed:
         raise KervError(failed[0].reason)
     entry = find_run(database, name, exact=True)

@@ -23,8 +23,8 @@ from kerv_cli.cli.common import (
 
 if TYPE_CHECKING:
     from kerv_cli.episodes.resolve import ResolvedStudy
-    from kerv_cli.lab.store import Study
-    from kerv_cli.lab.study import Outcome, TimeLeft
+    from kerv_cli.lab.follow import Outcome, TimeLeft
+    from kerv_cli.lab.study import Plan
     from kerv_cli.lab.work import Event
     from kerv_cli.report.report import Report
     from kerv_cli.report.reprice import Priced
@@ -36,42 +36,27 @@ BUSY = 1.2
 """Load average per core above which a line says that other programs disturb the measured times."""
 
 
-def planned_study(resolved: ResolvedStudy, command: Sequence[str], is_rollout: bool = False) -> Study:
-    """Plan a study or a rollout: find out which of its episodes must run. Print notes on the plan to standard error.
-
-    The notes give the number of episodes, the overrides that have no effect, the tasks that the policy was not trained
-    on, and whether an interrupted rollout is resumed.
-
-    Args:
-        resolved: The study with all its settings.
-        command: Command-line arguments after `kerv`, to be stored with the episodes.
-        is_rollout: Whether to plan a rollout.
-    """
+def announce(resolved: ResolvedStudy, is_rollout: bool = False) -> None:
+    """Print the number of episodes, and the overrides that have no effect, before torch and the simulator load."""
     from kerv_cli.episodes.resolve import idle_overrides
 
     settings, tasks = resolved.settings, resolved.tasks
     what = next(iter(settings)) if len(settings) == 1 else f"{len(settings)} settings"
     whose = _few(list(dict.fromkeys(setting.policy.target for setting in settings.values())), "targets")
     number = len(settings) * len(tasks) * resolved.first.episodes
-    where = _few(tasks, "tasks")
     for override, reason in idle_overrides(resolved, not is_rollout).items():
         typer.echo(f"note: {override} has no effect: {reason}", err=True)
-    # printed before torch and the simulator load
-    typer.echo(f"{what} of {whose} on {where}: {count(number, 'episode')}", err=True)
-    from kerv_cli.lab.database import opened
-    from kerv_cli.lab.store import ROLLOUT, SWEEP
-    from kerv_cli.lab.study import plan
+    typer.echo(f"{what} of {whose} on {_few(tasks, 'tasks')}: {count(number, 'episode')}", err=True)
+
+
+def check_installed(planned: Plan, resolved: ResolvedStudy) -> None:
+    """Refuse tasks whose simulator is missing. Print the tasks that the policy was not trained on."""
     from kerv_cli.worlds import spec_of
 
-    planned = plan(resolved, opened(resolved.first.results), command, ROLLOUT if is_rollout else SWEEP)
     for target, names in resolved.unseen.items():
         typer.echo(f"kerv: warning: policy {target} was never trained on {', '.join(names)}", err=True)
     for task in dict.fromkeys(one.task for one in planned.to_run):
         spec_of(task).check_installed(resolved.first.policy.target)
-    if is_rollout and planned.existing:
-        there, wanted = len(planned.existing), len(planned.episodes)
-        typer.echo(f"resuming {planned.name}: {there} of {wanted} episodes are there", err=True)
-    return planned
 
 
 def _few(names: Sequence[str], what: str) -> str:
@@ -91,7 +76,7 @@ def print_settings(resolved: ResolvedStudy) -> None:
         typer.echo(f"--- # {label}\n{settings_yaml(settings)}", nl=False)
 
 
-def print_study_plan(planned: Study, as_json: bool, guess: float = SECONDS_PER_EPISODE) -> None:
+def print_study_plan(planned: Plan, as_json: bool, guess: float = SECONDS_PER_EPISODE) -> None:
     """Print which episodes would run, why, and how long that would take. For the option --plan.
 
     Args:
@@ -99,27 +84,27 @@ def print_study_plan(planned: Study, as_json: bool, guess: float = SECONDS_PER_E
         as_json: Whether to print the plan as JSON.
         guess: Seconds per episode, used if no episode was measured.
     """
-    from kerv_cli.lab.study import TimeLeft
+    from kerv_cli.lab.follow import TimeLeft
     from kerv_cli.lab.workers import disturbances
 
-    rows, to_run, reused = _plan_rows(planned), planned.to_run, planned.existing
+    rows, to_run, reused, study = _plan_rows(planned), planned.to_run, planned.existing, planned.study
     left = TimeLeft(planned, guess)
     if as_json:
-        end_with_json({"study": planned.name, "folder": planned.root, "settings": rows, "to run": len(to_run),
+        end_with_json({"study": study.name, "folder": study.root, "settings": rows, "to run": len(to_run),
                        "reused": len(reused), "seconds": left.seconds, "source": left.source})  # fmt: skip
-    print_rows(rows, f"study {planned.name}, episodes")
+    print_rows(rows, f"study {study.name}, episodes")
     for warning in disturbances(planned):
         typer.echo(f"kerv: warning: {warning}", err=True)
     typer.echo(f"{count(len(to_run), 'episode')} to run, {len(reused)} reused, {about(left.seconds, left.source)}")
 
 
-def _plan_rows(planned: Study) -> list[dict[str, object]]:
+def _plan_rows(planned: Plan) -> list[dict[str, object]]:
     """Return one table row per setting: numbers of missing and existing episodes, and why episodes will run."""
     from kerv_cli.lab.plan import grouped, seeds_text
 
-    of_label = grouped(planned.episodes, attrgetter("setting.label"))
+    of_label = grouped(planned.study.episodes, attrgetter("setting.label"))
     rows: list[dict[str, object]] = []
-    for label in planned.labels:
+    for label in planned.study.labels:
         episodes = of_label[label]
         reasons = [planned.missing[one] for one in episodes if one in planned.missing]
         rows.append(
@@ -135,18 +120,13 @@ def _plan_rows(planned: Study) -> list[dict[str, object]]:
     return rows
 
 
-def run_study(planned: Study, guess: float = SECONDS_PER_EPISODE) -> Outcome:
-    """Run the missing episodes of a plan and show the progress, with the time left.
-
-    Args:
-        planned: The plan.
-        guess: Seconds per episode, used while no episode is measured.
-    """
-    from kerv_cli.lab.study import TimeLeft, run
+def run_plan(planned: Plan, guess: float = SECONDS_PER_EPISODE) -> Outcome:
+    """Run the missing episodes of a plan and show the progress, with the time left."""
+    from kerv_cli.lab.follow import TimeLeft, run
     from kerv_cli.report.viewing import save_recording
 
     with progress_bar("episodes", has_estimate=True) as show:
-        return run(planned, event_printer(show, TimeLeft(planned, guess)), save=save_recording)
+        return run(planned, event_printer(show, TimeLeft(planned, guess)), write=save_recording)
 
 
 def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None = None) -> Callable[[Event], None]:
@@ -158,7 +138,7 @@ def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None =
         show: Moves the bar, see `progress_bar`.
         left: Estimates the time left. If None, no time is shown.
     """
-    from kerv_cli.lab.work import BlockStarted, BlocksWait, Preparing, SettingFailed, Started
+    from kerv_cli.lab.work import BlockStarted, BlocksWait, Counted, Preparing, SettingFailed, Started
 
     total = ended = 0
     title = "starting"
@@ -176,28 +156,27 @@ def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None =
             line = f"{count(event.reused, 'episode')} there already" if event.reused else ""
             if left is not None and total:
                 line = ", ".join(filter(None, (line, f"{total} to run", about(left.seconds, left.source))))
+        elif isinstance(event, Counted):
+            ended = max(0, total - sum(event.left.values()))
         elif isinstance(event, BlockStarted):
             title = event.block.title
-            if left is not None and left.workers > 1 and not ended and not on_terminal:
-                line = f"a worker begins {title}"
         elif isinstance(event, Preparing):
             preparing = f"preparing {event.setting.label}, {event.number} of {event.of}"
             if total:
                 show(ended, total, preparing)
             line = "" if ended or on_terminal else preparing
         elif isinstance(event, BlocksWait):
-            line = "other processes run all blocks that are left: waiting for them"
+            waits = f"{count(event.episodes, 'episode')} left: "
+            line = waits + ("other processes run them" if event.has_workers else "no worker runs them")
         elif isinstance(event, SettingFailed):
             ended += len(event.episodes)
             one = event.episodes[0]
             line = f"{one.setting.label} on {one.task}: failed: {event.reason}"
         else:
             ended += 1
-            one, result = event.episode, "run by another sweep"
-            if not event.elsewhere:
-                result = f"{'success' if event.success else 'failure'}, {event.seconds:.1f} s"
-            if event.elsewhere or ended <= 100 or on_terminal:
-                of_all = f"/{total}" if total else ""  # a worker does not know how many the study has
+            one, result = event.episode, f"{'success' if event.success else 'failure'}, {event.seconds:.1f} s"
+            of_all = f"/{total}" if total else ""  # a worker does not know how many the study has
+            if ended <= 100 or on_terminal:
                 line = f"{ended}{of_all} {one.setting.label} on {one.task}, seed {one.seed}: {result}"
         if line:
             typer.echo(line, err=True)

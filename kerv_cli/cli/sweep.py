@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import typer
@@ -10,31 +11,32 @@ from kerv_cli.base.config import compose, expand, groups, split
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
 from kerv_cli.cli.command import Cfg, command
-from kerv_cli.cli.common import AsJson, ShowPlan, end_with_json, end_with_plan, print_rows
+from kerv_cli.cli.common import AsJson, ShowPlan, end_with_json, print_rows, progress_bar
 from kerv_cli.cli.studies import (
-    planned_study,
+    announce,
+    check_installed,
+    event_printer,
     print_prices,
     print_settings,
     print_study,
     print_study_plan,
     print_verdict,
-    run_study,
 )
 from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 
 if TYPE_CHECKING:
-    from kerv_cli.episodes.resolve import ResolvedStudy
+    from kerv_cli.lab.follow import Outcome
     from kerv_cli.lab.store import Study
-    from kerv_cli.lab.study import Outcome
+    from kerv_cli.report.tables import StudyData
 
 
 @command(
     "sweep",
     SweepSettings,
-    keys="study task episodes policy rerun loss runtime.workers runtime.executor results",
+    keys="study task episodes policy rerun loss runtime.workers runtime.launch results",
     each="rollout",
 )
-def sweep(overrides: list[str], cfg: Cfg = False, plan: ShowPlan = False, as_json: AsJson = False) -> None:
+def sweep(overrides: list[str], cfg: Cfg = False, show_plan: ShowPlan = False, as_json: AsJson = False) -> None:
     """Run a study: every setting on every task with the same seeds, in turn. Existing episodes are reused.
 
     Without study= it lists all studies. The same command continues an interrupted study.
@@ -56,12 +58,29 @@ def sweep(overrides: list[str], cfg: Cfg = False, plan: ShowPlan = False, as_jso
     if cfg:
         print_settings(resolved)
         return
-    study = planned_study(resolved, ["sweep", *overrides])
-    if plan:
-        print_study_plan(study, as_json, resolved.study.seconds)
+    announce(resolved)
+    from kerv_cli.lab.database import opened
+    from kerv_cli.lab.follow import TimeLeft, begun, follow
+    from kerv_cli.lab.study import check, plan, save
+    from kerv_cli.lab.work import EpisodeRunner
+    from kerv_cli.lab.workers import workers
+    from kerv_cli.report.viewing import save_recording
+
+    planned = plan(resolved, check(resolved), opened(resolved.first.results), ["sweep", *overrides])
+    check_installed(planned, resolved)
+    study, guess = planned.study, resolved.study.seconds
+    if show_plan:
+        print_study_plan(planned, as_json, guess)
         return
-    outcome = run_study(study, resolved.study.seconds)
-    _print_outcome(outcome, resolved, study, as_json)
+    with begun(planned) as run, progress_bar("episodes", has_estimate=True) as show:
+        save(planned, run.id)
+        with workers(planned, run.id, partial(typer.echo, err=True)) as tend:
+            on_event = event_printer(show, TimeLeft(planned, guess))
+            outcome = follow(planned, run, tend, EpisodeRunner(study.rollouts, save_recording), on_event)
+    data = tables(study, outcome)
+    print_outcome(study, outcome, data, as_json)
+    write(study, outcome, data, resolved.sweep.loss)
+    raise typer.Exit(int(bool(outcome.failed)))
 
 
 def _list_studies(as_json: bool) -> None:
@@ -82,16 +101,16 @@ def _list_studies(as_json: bool) -> None:
     typer.echo("run one, e.g.: kerv sweep study=demo; what it would do: --plan")
 
 
-def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, study: Study, as_json: bool) -> None:
-    """Print the results of a sweep and end the command, with exit code 1 if episodes failed."""
+def tables(study: Study, outcome: Outcome) -> StudyData | None:
+    """Read the results of a sweep's episodes. None if it has none."""
     from kerv_cli.report.tables import load_study
 
-    if outcome.detached:
-        missing = count(len(study.to_run), "episode")
-        text = f"{missing} to run: {outcome.detached}; the same command follows them"
-        end_with_plan(text, as_json)
     there = [*outcome.done, *outcome.reused]
-    data = load_study(study, there) if there else None
+    return load_study(study, there) if there else None
+
+
+def print_outcome(study: Study, outcome: Outcome, data: StudyData | None, as_json: bool) -> None:
+    """Print the errors, the table and the counts of a sweep. With `as_json`, end the command."""
     failed = sum(len(failure.episodes) for failure in outcome.failed)
     counts = {"run": len(outcome.done), "reused": len(outcome.reused), "failed": failed}
     for failure in outcome.failed:
@@ -108,12 +127,17 @@ def _print_outcome(outcome: Outcome, resolved: ResolvedStudy, study: Study, as_j
         rate = len(outcome.done) / minutes
         typer.echo(f"{count(len(outcome.done), 'episode')} in {minutes:.1f} min: {rate:.0f} per minute")
     typer.echo(", ".join(f"{number} {what}" for what, number in counts.items()))
-    if data is not None and not failed:
-        from kerv_cli.report.report import write_study
 
-        # the study in the database may have more tasks, from earlier sweeps
-        is_whole = study.counts()[1] == len(data.study.episodes)
-        report = write_study(data if is_whole else load_study(study), resolved.sweep.loss)
-        print_prices(report.priced)
-        print_verdict(report)
-    raise typer.Exit(int(bool(failed)))
+
+def write(study: Study, outcome: Outcome, data: StudyData | None, loss: float) -> None:
+    """Write the report of a complete study, and print its verdict."""
+    from kerv_cli.report.report import write_study
+    from kerv_cli.report.tables import load_study
+
+    if data is None or outcome.failed:
+        return
+    # the study in the database may have more tasks, from earlier sweeps
+    is_whole = study.counts()[1] == len(data.study.episodes)
+    report = write_study(data if is_whole else load_study(study), loss)
+    print_prices(report.priced)
+    print_verdict(report)

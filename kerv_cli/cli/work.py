@@ -1,4 +1,4 @@
-"""`kerv work`: run blocks of a study that a sweep has planned. Any number of processes may do so at once."""
+"""`kerv work`: run episodes that a sweep has planned. Any number of processes may do so at once."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from kerv_cli.episodes.settings import WorkSettings
 
 @command("work", WorkSettings, keys="study results")
 def work(settings: WorkSettings) -> None:
-    """Run blocks of a study that 'kerv sweep' has planned, until none is left; on any machine, as often as you like.
+    """Run episodes that 'kerv sweep' has planned, until none is left; on any machine, as often as you like.
 
     Examples:
         kerv work study=demo
@@ -44,4 +44,4 @@ def work(settings: WorkSettings) -> None:
         work_on(store, settings.run, on_event, save_recording)
     except KeyboardInterrupt:
         raise Interrupted(f"interrupted after {count(ended, 'episode')}: other workers go on") from None
-    typer.echo(f"{count(ended, 'episode')} run, no block of {store.name} is left")
+    typer.echo(f"{count(ended, 'episode')} run, none of {store.name} is left")

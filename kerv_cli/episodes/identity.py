@@ -36,7 +36,7 @@ OBSERVATION = "observation"
 NOT_DETERMINING = frozenset(
     {"task", "episodes", "seed", "policy", "method", "results", "store", "record", "record_size"}
 )
-NOT_DETERMINING_RUNTIME = frozenset({"workers", "executor", "executor_options", "detach"})
+NOT_DETERMINING_RUNTIME = frozenset({"workers", "launch"})
 
 
 @dataclass(frozen=True, eq=False)

@@ -121,7 +121,7 @@ class SweepSettings(CommandSettings):
 
 @dataclass(kw_only=True)
 class WorkSettings(CommandSettings):
-    """Settings of `kerv work`, which runs blocks (groups of episodes) that a sweep has planned and queued."""
+    """Settings of `kerv work`, which runs episodes that a sweep has planned."""
 
     study: str = setting("", "name or file of the study")
-    run: str = setting("", "only blocks of the command with this id, whose process ends this one by closing its input")
+    run: str = setting("", "id of the command that has started this process, and ends it by closing its input")

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import os
+import json
 import re
 import sqlite3
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import sqlalchemy as sa
 
@@ -29,8 +30,7 @@ FILE = "kerv.db"
 SCHEMA = 2
 """Version of the tables. A database with another version is refused.
 
-A new column in MEASURES, or the table QUEUE, needs no new version: it is added at the next write. Until then the
-column reads as null.
+A new column in MEASURES needs no new version: it is added at the next write. Until then it reads as null.
 """
 LOCK_SECONDS = 60
 """Longest time to wait for another process's transaction in a SQLite file, seconds."""
@@ -46,63 +46,27 @@ class Damaged(ValueError):
     """A stored value has the wrong type or form for its column. `Database` turns this into a CheckpointError."""
 
 
-def _is_time(text: str) -> bool:
-    return bool(datetime.fromisoformat(text))
+class _Text(sa.types.TypeDecorator[str]):
+    """Text. What databases refuse, such as NUL, is written as an escape."""
 
-
-def _is_kind(text: str) -> bool:
-    return text in ("sweep", "rollout")
-
-
-class _Checked(sa.types.TypeDecorator[Any]):
-    """Type of a column whose values are checked when they are read: SQLite stores any value in any column.
-
-    Args:
-        kind: Type of the values in Python. Objects and lists are stored as JSON.
-        check: Says whether a value is valid, or raises ValueError. If None, every value of the type is valid.
-    """
-
-    impl: Any = sa.Text
+    impl = sa.Text
     cache_ok = True
-    _STORED: ClassVar = {str: sa.Text, int: sa.Integer, float: sa.Float}
 
-    def __init__(self, kind: type, check: Callable[[Any], bool] | None = None) -> None:
-        super().__init__()
-        self.kind, self.check = kind, check
-        self.impl = self._STORED[kind]() if kind in self._STORED else sa.JSON(none_as_null=True)
-
-    def process_bind_param(self, value: Any, dialect: sa.Dialect) -> Any:
-        """Return what to store. Text that databases refuse, such as NUL, is written as an escape."""
-        if isinstance(value, str):
-            return value.encode("utf-8", "backslashreplace").decode().replace("\0", r"\x00")
-        return value
-
-    def result_processor(self, dialect: sa.Dialect, coltype: object) -> Any:
-        """Return the function that turns a stored value into a value of Python. It raises Damaged for a wrong value."""
-        inner = super().result_processor(dialect, coltype)
-
-        accepted = (float, int) if self.kind is float else self.kind
-
-        def process(stored: Any) -> Any:
-            with contextlib.suppress(ValueError, TypeError, RecursionError):
-                value = inner(stored) if inner else stored
-                if value is None or (isinstance(value, accepted) and (self.check is None or self.check(value))):
-                    return value
-            raise Damaged(f"{stored!r:.60} is no {self.kind.__name__}")
-
-        return process
+    def process_bind_param(self, value: str | None, dialect: sa.Dialect) -> str | None:
+        if value is None:
+            return None
+        return value.encode("utf-8", "backslashreplace").decode().replace("\0", r"\x00")
 
 
-_TEXT, _INTEGER, _FLOAT, _OBJECT, _LIST = map(_Checked, (str, int, float, dict, list))
-_TIME, _KIND = _Checked(str, _is_time), _Checked(str, _is_kind)
+_JSON = sa.JSON(none_as_null=True)
 
 
 def _table(name: str, *columns: sa.schema.SchemaItem) -> sa.Table:
-    return sa.Table(name, _META, *columns)
+    # sqlite_autoincrement: the row number of a removed row is never given to another
+    return sa.Table(name, _META, *columns, sqlite_autoincrement=isinstance(columns[0].type, sa.Integer))  # type: ignore[attr-defined]
 
 
 def _required(kind: Any, *names: str) -> list[sa.Column[Any]]:
-    """Return columns of one type that cannot be null, one for each name."""
     return [sa.Column(name, kind, nullable=False) for name in names]
 
 
@@ -111,55 +75,57 @@ def _to(name: str, column: str, **options: Any) -> sa.Column[Any]:
     return sa.Column(name, sa.ForeignKey(column, ondelete="CASCADE"), **options)
 
 
-ABOUT = _table("kerv", sa.Column("key", _TEXT, primary_key=True), sa.Column("value", _TEXT, nullable=False))
+ABOUT = _table("kerv", sa.Column("key", _Text, primary_key=True), sa.Column("value", _Text, nullable=False))
 RUNS = _table(
     "runs",  # one row per command that was started
     # kind: sweep, rollout, import, or a kind of artifact; name: of the study or the artifact; started: ISO 8601, UTC;
-    # command: command-line arguments without `kerv`; heartbeat: seconds since 1970
-    sa.Column("id", _TEXT, primary_key=True),
-    *_required(_TEXT, "kind", "name", "status", "host", "git_commit", "message"),
-    *_required(_TIME, "started"),
-    *_required(_INTEGER, "done", "total", "pid"),
-    *_required(_LIST, "command"),
-    *_required(_FLOAT, "heartbeat"),
-    sa.Column("finished", _TIME),
+    # command: command-line arguments without `kerv`
+    sa.Column("id", _Text, primary_key=True),
+    *_required(_Text, "kind", "name", "status", "host", "git_commit", "message", "started"),
+    *_required(sa.Integer, "done", "total"),
+    *_required(_JSON, "command"),
+    sa.Column("finished", _Text),
     sa.Index("runs_of_name", "kind", "name"),
+)
+WORKERS = _table(
+    "workers",  # one row per living command or worker; `lab/presence.py` says who lives
+    sa.Column("name", _Text, primary_key=True),
+    *_required(_Text, "run", "host"),  # run: id of the command for which it works; empty: any command
+    *_required(sa.Double, "heartbeat"),  # newest sign of life, seconds since 1970 by the database's clock
 )
 STUDIES = _table(
     "studies",
     sa.Column("id", sa.Integer, primary_key=True),
-    sa.Column("name", _TEXT, nullable=False, unique=True),
-    *_required(_KIND, "kind"),
-    *_required(_TEXT, "created"),
-    *_required(_OBJECT, "about"),  # title, baseline, axis, note, block, machines
+    sa.Column("name", _Text, nullable=False, unique=True),
+    *_required(_Text, "kind", "created"),  # kind: sweep, rollout or import
+    *_required(_JSON, "about"),  # title, baseline, axis, note, block, machines
 )
 SETTINGS = _table(
     "settings",  # a row of a study's table
     sa.Column("id", sa.Integer, primary_key=True),
     _to("study_id", "studies.id", nullable=False, index=True),
-    sa.Column("work", _TEXT, nullable=False, index=True),  # hash of what determines a result
-    *_required(_INTEGER, "position"),
-    *_required(_TEXT, "label", "name", "method"),  # name: shared by the settings of a grid
+    sa.Column("work", _Text, nullable=False, index=True),  # hash of what determines a result
+    *_required(sa.Integer, "position"),
+    *_required(_Text, "label", "name", "method"),  # name: shared by the settings of a grid
     # varies: key -> value in a grid; identity: hashes of weights and data
-    *_required(_OBJECT, "varies", "settings", "identity"),
-    *_required(_LIST, "overrides"),  # from which the setting is composed
+    *_required(_JSON, "varies", "settings", "identity", "overrides"),  # overrides: from which it is composed
     sa.UniqueConstraint("study_id", "label"),
 )
 BLOCKS = _table(
     "blocks",  # one attempt to run a group of episodes in one process, with settings taking turns
-    sa.Column("id", _TEXT, primary_key=True),
-    *_required(_TEXT, "run", "seeds", "started"),
-    *_required(_OBJECT, "about"),  # machine, versions, commit, executor, workers
+    sa.Column("id", _Text, primary_key=True),
+    *_required(_Text, "run", "seeds", "started"),
+    *_required(_JSON, "about"),  # machine, versions, commit, workers
 )
 _TYPES = {FLAG: sa.Boolean, INT: sa.BigInteger, FLOAT: sa.Double}
-MEASURES = tuple(sa.Column(field.name, _TYPES.get(field.type, sa.JSON(none_as_null=True))) for field in EPISODE_SCHEMA)
+MEASURES = tuple(sa.Column(field.name, _TYPES.get(field.type, _JSON)) for field in EPISODE_SCHEMA)
 """Columns of the table of episodes that are computed from an episode's record."""
 EPISODES = _table(
     "episodes",
     sa.Column("id", sa.Integer, primary_key=True),
-    *_required(_TEXT, "work", "task", "started"),
+    *_required(_Text, "work", "task", "started"),
     *_required(sa.BigInteger, "seed"),
-    *_required(_INTEGER, "order"),  # order: number of episodes that the block ran before it
+    *_required(sa.Integer, "order"),  # order: number of episodes that the block ran before it
     sa.Column("block", sa.ForeignKey("blocks.id"), nullable=False),
     *MEASURES,
     *_required(sa.LargeBinary, "decode_seconds"),  # (decodes,) little-endian float64
@@ -170,30 +136,24 @@ DECODES = _table(
     "decodes", _to("episode_id", "episodes.id", primary_key=True), sa.Column("parquet", sa.LargeBinary, nullable=False)
 )
 WANTED = _table(
-    "wanted",  # all episodes of a study; an episode without episode_id has not run
+    "wanted",  # plan, queue and progress of every study: a row per setting, task and seed
     _to("setting_id", "settings.id", primary_key=True),
-    sa.Column("task", _TEXT, primary_key=True),
+    sa.Column("task", _Text, primary_key=True),
     sa.Column("seed", sa.BigInteger, primary_key=True),
-    *_required(_INTEGER, "position"),
+    *_required(sa.Integer, "study_id", "position"),  # study_id: that of the setting
     sa.Column("episode_id", sa.ForeignKey("episodes.id", ondelete="SET NULL"), index=True),
-    sa.Column("error", _TEXT),  # if the last attempt failed: the error in one line, then its traceback
+    sa.Column("error", _Text),  # if the last attempt failed: the error in one line, then its traceback
+    sa.Column("block", sa.Integer),  # number of the block in which it runs or ran; null: nobody asks for it now
+    sa.Column("worker", _Text),  # name of the worker that has claimed it, or ran it
+    sa.Column("attempts", sa.Integer, nullable=False, default=0),  # workers that died in it, and the one that runs it
+    sa.Column("anew", sa.Boolean, nullable=False, default=False),  # rerun=all: stored episodes do not count
 )
+UNFINISHED = sa.and_(WANTED.c.block.is_not(None), WANTED.c.episode_id.is_(None), WANTED.c.error.is_(None))
+"""Condition: the row waits for a worker, or has one. A row with neither block, episode nor error is not asked for."""
+for _name, _columns in {"wanted_blocks": ("study_id", "block"), "wanted_workers": ("worker",)}.items():
+    sa.Index(_name, *(WANTED.c[one] for one in _columns), sqlite_where=UNFINISHED, postgresql_where=UNFINISHED)
 PLANNED = WANTED.join(SETTINGS).join(STUDIES)
 """Each planned episode with its setting and its study."""
-QUEUE = _table(
-    "queue",  # blocks that wait or run: a row is deleted when its block has ended
-    sa.Column("id", sa.Integer, primary_key=True),
-    _to("study_id", "studies.id", nullable=False),
-    *_required(_TEXT, "run"),  # id of the command that planned the block
-    *_required(_INTEGER, "position", "newest"),  # newest: largest episodes.id when the block was planned
-    *_required(_LIST, "episodes"),  # work, task and seed of each
-    *_required(_OBJECT, "about"),  # executor, workers
-    sa.Column("worker", _TEXT, index=True),  # the process that has claimed the block; null: none
-    sa.Column("heartbeat", _FLOAT),  # its newest sign of life, seconds since 1970 by the database's clock
-    sa.Column("running", _LIST),  # the episode that it runs
-    sa.Column("died", _LIST),  # the episode in which the worker before it died
-    sa.Index("queue_of_study", "study_id", "position"),
-)
 
 
 def now() -> str:
@@ -266,11 +226,7 @@ class Database:
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[sa.Connection]:
-        """Yield a connection for reading. If there is no database yet, its tables are empty.
-
-        Raises:
-            StorageError: The database cannot be read, or its file was written during reading.
-        """
+        """Yield a connection for reading. If there is no database yet, its tables are empty."""
         with self._errors():
             if self._engine is None and not self.exists:
                 engine = sa.create_engine("sqlite://", poolclass=sa.pool.NullPool)
@@ -279,11 +235,7 @@ class Database:
                     yield connection
                 return
             with self._opened().connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
-                try:
-                    yield connection
-                finally:
-                    if self.file and connection.info.get(_CHANGED, found := _changed(self.file)) != found:
-                        raise StorageError(f"{self.file} was written while it was read: type the command again")
+                yield connection
 
     @contextlib.contextmanager
     def kept_open(self) -> Iterator[None]:
@@ -302,7 +254,6 @@ class Database:
             engine = self._opened(create=True).execution_options(kerv_writes=True)
             with engine.begin() as connection:
                 if not self._is_complete:
-                    QUEUE.create(connection, checkfirst=True)
                     _add_measures(connection)
                 yield connection
             self._is_complete = True
@@ -314,7 +265,6 @@ class Database:
                     self.file.parent.mkdir(parents=True, exist_ok=True)
             engine = _server(self._url) if self.file is None else _file(self.file)
             with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
-                _check_tables(connection)
                 version = _version(connection)
             if version is None:
                 with engine.execution_options(kerv_writes=True).begin() as connection:
@@ -331,7 +281,7 @@ class Database:
             yield
         except sa.exc.DBAPIError as error:
             raise self._explained(error) from error
-        except Damaged as error:
+        except (Damaged, json.JSONDecodeError, UnicodeDecodeError) as error:
             raise self._damaged(error) from error
 
     @contextlib.contextmanager
@@ -365,8 +315,8 @@ class Database:
         hint = ""
         if "lock" in why:
             hint = ": put results= on a local disk, or use a server, store=postgresql://USER@HOST/DB"
-        elif "unable to open" in why and _log(self.file):
-            hint = f": copy {self.results} to where you can write, its newest rows are in {self.file.name}-wal"
+        elif "unable to open" in why or "readonly" in why:
+            hint = f": copy {self.results} to a folder that you can write"
         return (Unanswered if "lock" in why else StorageError)(f"cannot use {self.file}: {why}{hint}")
 
 
@@ -408,90 +358,61 @@ def _server(url: sa.URL) -> sa.Engine:
     return engine
 
 
-_CHANGED = "changed"
-"""Key in the `info` of a connection that takes no locks. The value is the time of the file's last change."""
-
-
-class _Unlocked(sqlite3.Connection):
-    """A connection that takes no locks, because its user cannot write to the folder."""
+_begun = threading.local()
+"""The SQLite connection whose transaction this thread began last."""
 
 
 def _file(path: Path) -> sa.Engine:
-    connect = functools.partial(_connection, path)
-    engine = sa.create_engine("sqlite://", creator=connect, poolclass=sa.pool.NullPool)
-    sa.event.listen(engine, "connect", functools.partial(_configure, path))
+    engine = sa.create_engine("sqlite://", creator=functools.partial(_connection, path), poolclass=sa.pool.NullPool)
     sa.event.listen(engine, "begin", _begin)
     return engine
 
 
-def _connection(path: Path) -> sqlite3.Connection:
-    """Open a SQLite file. Create nothing if this user cannot write the file or its folder.
+class _Connection(sqlite3.Connection):
+    """A connection that rolls back before it is closed.
 
-    Such a user reads the file and the log of a process that is writing. Without a log, the file has all rows.
+    Ctrl-C can leave a cursor open, which keeps the transaction of a closed connection.
     """
-    options: Any = {"uri": True, "timeout": LOCK_SECONDS, "check_same_thread": False}
-    uri = path.absolute().as_uri()
-    if all(os.access(one, os.W_OK) for one in (path.parent, path) if one.exists()):
-        return sqlite3.connect(uri, **options)
-    while _log(path):
-        connection = sqlite3.connect(f"{uri}?mode=ro&readonly_shm=1", **options)
-        try:
-            connection.execute("SELECT count(*) FROM sqlite_schema")
-            return connection
-        except sqlite3.OperationalError:
-            connection.close()
-            if _log(path):  # otherwise its writer has just ended, and moved the log into the file
-                raise
-    return sqlite3.connect(f"{uri}?mode=ro&immutable=1", factory=_Unlocked, **options)
+
+    def close(self) -> None:
+        with contextlib.suppress(sqlite3.Error):
+            self.rollback()
+        super().close()
 
 
-def _log(path: Path) -> bool:
-    """Return whether SQLite's write-ahead log of a file has rows."""
-    log = path.with_name(f"{path.name}-wal")
-    return log.is_file() and log.stat().st_size > 0
-
-
-def _changed(path: Path) -> int:
-    """Return the time of a file's last change, in nanoseconds."""
-    return path.stat().st_mtime_ns
-
-
-def _configure(path: Path, connection: Any, record: Any) -> None:
-    """Set up a new SQLite connection."""
-    if isinstance(connection, _Unlocked):
-        record.info[_CHANGED] = _changed(path)
+def _connection(path: Path) -> sqlite3.Connection:
+    connection = sqlite3.connect(path, timeout=LOCK_SECONDS, check_same_thread=False, factory=_Connection)
     connection.isolation_level = None  # `_begin` begins the transactions
     # a commit survives the end of this process; the log is flushed to the disk when it is moved into the file
     for pragma in ("journal_mode=WAL", "synchronous=NORMAL", "foreign_keys=ON"):
-        with contextlib.suppress(Exception):  # a read-only folder refuses the first
-            connection.execute(f"PRAGMA {pragma}")
+        connection.execute(f"PRAGMA {pragma}")
+    return connection
 
 
 def _begin(connection: sa.Connection) -> None:
     """Start a transaction. If it will write, first wait until no other process writes.
 
-    So what a writer has read stays true until it commits.
+    So what a writer has read stays true until it commits. Ctrl-C can come between a transaction's first statement and
+    the code that would end it: a thread that begins the next one rolls such a transaction back.
     """
-    if connection.get_execution_options().get("kerv_writes"):
-        postgresql = connection.dialect.name == "postgresql"
-        connection.exec_driver_sql("SELECT pg_advisory_xact_lock(5271009)" if postgresql else "BEGIN IMMEDIATE")
-
-
-def _check_tables(connection: sa.Connection) -> None:
-    """Refuse a view in place of a table, because the view's query may never end.
-
-    Raises:
-        Damaged: There is such a view.
-    """
-    for name in _META.tables.keys() & set(sa.inspect(connection).get_view_names()):
-        raise Damaged(f"{name} is a view, not a table")
+    if not connection.get_execution_options().get("kerv_writes"):
+        return
+    if connection.dialect.name == "postgresql":
+        connection.exec_driver_sql("SELECT pg_advisory_xact_lock(5271009)")
+        return
+    before: sqlite3.Connection | None = getattr(_begun, "connection", None)
+    if before is not None:
+        with contextlib.suppress(sqlite3.ProgrammingError):  # it is closed, as it should be
+            before.rollback()
+    _begun.connection = connection.connection.dbapi_connection
+    connection.exec_driver_sql("BEGIN IMMEDIATE")
 
 
 def _version(connection: sa.Connection) -> int | None:
     if not sa.inspect(connection).has_table(ABOUT.name):
         return None
     version = connection.scalar(sa.select(ABOUT.c.value).where(ABOUT.c.key == "schema_version"))
-    if version is not None and not re.fullmatch(r"[1-9]\d{0,8}", version, re.ASCII):
+    if version is not None and not re.fullmatch(r"[1-9]\d{0,8}", str(version), re.ASCII):
         raise Damaged(f"schema_version is {version!r:.60}")
     return None if version is None else int(version)
 
@@ -530,6 +451,7 @@ def other_schema(name: str | Path, version: int) -> CheckpointError:
     """Return the error to raise for a database that an older or newer version of kerv has written."""
     if version < SCHEMA:
         return CheckpointError(
-            f"{name} is from an older kerv (schema {version}, this one reads {SCHEMA}): choose another results= folder"
+            f"{name} is of kerv 1.0 (schema {version}, this one reads {SCHEMA}): choose another folder with results=; "
+            "'kerv runs export NAME' of kerv 1.0 writes its tables"
         )
     return CheckpointError(f"{name} is from a newer kerv (schema {version}, this one reads {SCHEMA}): update kerv")

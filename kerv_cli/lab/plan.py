@@ -25,7 +25,7 @@ FULL_BATCHES = 16
 """Largest number of batches in a block."""
 
 NEVER, ALL = "never", "all"
-"""Values of `rerun=`: which existing episodes run again."""
+"""Values of `rerun=`, which says which existing episodes to run again."""
 
 Key = tuple[str, str, int]
 """A setting's hash `work`, task and seed. Equal keys mean the same episode in any study."""
@@ -83,21 +83,23 @@ class StoredEpisode:
 
     Attributes:
         id: Row number of the episode.
-        success: Whether the task was solved.
-        seconds: Wall time.
         block: Id of the block (episodes run by one process) in which it ran.
-        run: Id of the command that ran it.
         started: Time at which that block began (ISO 8601).
         seeds: Seeds of the block, as `seeds_text` writes them.
     """
 
     id: int
-    success: bool
-    seconds: float
     block: str
-    run: str
     started: str
     seeds: str
+
+
+@dataclass(frozen=True)
+class KnownRow:
+    """What a study's row of an episode says: its stored episode, and whether other stored episodes do not count."""
+
+    episode_id: int | None
+    anew: bool
 
 
 @dataclass(frozen=True)
@@ -168,47 +170,43 @@ def split(
     episodes: Sequence[Episode],
     block: int,
     stored: Mapping[Key, Sequence[StoredEpisode]],
+    known: Mapping[Episode, KnownRow],
     rerun: str = NEVER,
-    since: str = "",
     earlier: Mapping[str, Setting] | None = None,
-) -> tuple[dict[Episode, StoredEpisode], dict[Episode, str]]:
+) -> tuple[dict[Episode, int], dict[Episode, str]]:
     """Divide a study's episodes into existing and missing ones.
 
     Args:
         episodes: The study's episodes.
         block: Number of seeds in a block, which one process runs.
         stored: Episodes in the database, by `Episode.key`.
-        rerun: Which existing episodes to run again: NEVER or ALL.
-        since: Used only with ALL, if a command is resumed: the time at which it first began (ISO 8601). Episodes of
-            blocks that began then or later count as existing, because this command ran them. If empty, all episodes
-            run again.
+        known: Rows of the study that a database has already. A row keeps its episode. A row that ALL has emptied stays
+            empty until it has run.
+        rerun: Which existing episodes to run again, NEVER or ALL.
         earlier: The newest stored setting by label. Used to explain what has changed.
 
     Returns:
-        Two mappings: from each existing episode to its row, and from each missing episode to the reason for running it.
+        Two mappings: from each existing episode to its row number, and from each missing episode to the reason for
+        running it.
     """
-
-    def is_usable(row: StoredEpisode) -> bool:
-        return rerun != ALL or (bool(since) and row.started >= since)
-
     usable: dict[Episode, list[StoredEpisode]] = {}
     for one in episodes:
-        usable[one] = list(filter(is_usable, stored.get(one.key, ())))
+        row, rows = known.get(one, KnownRow(None, False)), list(stored.get(one.key, ()))
+        linked = [each for each in rows if each.id == row.episode_id]
+        usable[one] = [] if rerun == ALL or (row.anew and not linked) else linked or rows
     _keep_whole_orders(usable, block)
-    existing: dict[Episode, StoredEpisode] = {}
-    for turn in _turns(episodes).values():
+    existing: dict[Episode, int] = {}
+    for turn in grouped(episodes, lambda one: (one.task, one.seed)).values():
         existing |= _rows_of_turn(turn, usable)
-    for part in _ordered_parts(episodes, block):
+    for part in ordered_parts(episodes, block):
         if not existing.keys() >= set(part):
             for one in part:
                 existing.pop(one, None)
     return existing, _reasons(episodes, stored, existing, rerun, earlier or {})
 
 
-def _rows_of_turn(
-    turn: Sequence[Episode], usable: Mapping[Episode, Sequence[StoredEpisode]]
-) -> dict[Episode, StoredEpisode]:
-    """Choose one stored row for each episode of a turn (see `_turns`). Episodes without a row are left out.
+def _rows_of_turn(turn: Sequence[Episode], usable: Mapping[Episode, Sequence[StoredEpisode]]) -> dict[Episode, int]:
+    """Choose one stored row for each episode of a turn: a task and a seed. Episodes without a row are left out.
 
     If an episode has several rows, choose the row from the block that ran the most episodes of the turn. If several
     blocks ran equally many, choose the newest row.
@@ -219,14 +217,14 @@ def _rows_of_turn(
     found = {}
     for one in turn:
         if usable[one]:
-            found[one] = max(usable[one], key=lambda row: (in_block[row.block], row.started, row.id))
+            found[one] = max(usable[one], key=lambda row: (in_block[row.block], row.started, row.id)).id
     return found
 
 
 def _reasons(
     episodes: Sequence[Episode],
     stored: Mapping[Key, Sequence[StoredEpisode]],
-    existing: Mapping[Episode, StoredEpisode],
+    existing: Mapping[Episode, int],
     rerun: str,
     earlier: Mapping[str, Setting],
 ) -> dict[Episode, str]:
@@ -235,7 +233,6 @@ def _reasons(
     for work, task, *_ in stored:
         works.add(work)
         tasks.add((work, task))
-    of_rows = "rerun=all" if rerun == ALL else "order of episodes"
 
     @functools.cache
     def change(setting: Setting) -> str:
@@ -246,7 +243,8 @@ def _reasons(
         if one in existing:
             continue
         if stored.get(one.key):
-            reasons[one] = of_rows
+            is_ordered = one.setting.depends_on_order and rerun != ALL
+            reasons[one] = "order of episodes" if is_ordered else "rerun=all"
         elif one.key[:2] in tasks:
             reasons[one] = "new seeds"
         else:
@@ -262,12 +260,7 @@ def grouped(episodes: Iterable[Episode], key: Callable[[Episode], K]) -> dict[K,
     return groups
 
 
-def _turns(episodes: Iterable[Episode]) -> dict[tuple[str, int], list[Episode]]:
-    """Group episodes by task and seed. In such a group, the settings take turns."""
-    return grouped(episodes, lambda one: (one.task, one.seed))
-
-
-def _ordered_parts(episodes: Iterable[Episode], block: int) -> list[list[Episode]]:
+def ordered_parts(episodes: Iterable[Episode], block: int) -> list[list[Episode]]:
     """Return groups of episodes that must run together, in order, because each may change the results of the next.
 
     A group holds one setting and task, and `block` successive seeds. Episodes of settings whose results do not
@@ -291,7 +284,7 @@ def _keep_whole_orders(usable: dict[Episode, list[StoredEpisode]], block: int) -
         block: Number of seeds that the study keeps together.
     """
     sizes = Counter(map(attrgetter("block"), itertools.chain(*usable.values())))
-    for part in _ordered_parts(usable, block):
+    for part in ordered_parts(usable, block):
         seeds = seeds_text(map(attrgetter("seed"), part))
         by_block: dict[str, list[StoredEpisode]] = {}
         for row in itertools.chain(*map(usable.__getitem__, part)):
@@ -319,7 +312,7 @@ def blocks_of(episodes: Iterable[Episode], block: int, workers: int = 1) -> list
     """
     by_way = grouped(episodes, lambda one: one.setting.batch > 1)
     groups: dict[tuple[object, ...], list[Episode]] = {}
-    for (task, seed), turn in _turns(by_way.get(False, ())).items():
+    for (task, seed), turn in grouped(by_way.get(False, ()), lambda one: (one.task, one.seed)).items():
         for threads, part in grouped(turn, lambda one: one.setting.settings["runtime"]["threads"]).items():
             index = (seed - min(one.setting.settings["seed"] for one in part)) // block
             ordered = list(filter(attrgetter("setting.depends_on_order"), part))

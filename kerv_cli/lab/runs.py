@@ -5,41 +5,28 @@ A row says which process runs the command, how far it is, and how it ended.
 
 from __future__ import annotations
 
-import contextlib
 import math
-import os
 import secrets
 import socket
-import threading
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import sqlalchemy as sa
 
 from kerv_cli.base.durations import about, left
-from kerv_cli.base.errors import CheckpointError, Interrupted, KervError, StorageError, UsageError
-from kerv_cli.base.files import is_alive
+from kerv_cli.base.errors import CheckpointError, Interrupted, StorageError, UsageError
 from kerv_cli.lab.command import current_command
-from kerv_cli.lab.database import EPISODES, RUNS, STUDIES, Database, now
+from kerv_cli.lab.database import EPISODES, RUNS, STUDIES, WORKERS, Database, now
+from kerv_cli.lab.presence import Presence, living
 from kerv_cli.targets.provenance import git_commit
 
 RUNNING, COMPLETE, FAILED, INTERRUPTED = "running", "complete", "failed", "interrupted"
 
-BEAT_SECONDS = 5.0
-"""Seconds between two heartbeats of a run."""
 LOADING_SECONDS = 5.0
 """Guess of the seconds that every command takes to load libraries and the simulator, whatever its amount of work."""
-STALE_SECONDS = 900.0
-"""A run on another machine counts as dead after this many seconds without a heartbeat."""
-
-_open: set[str] = set()
-"""Ids of this process's runs that have not ended. A run that has ended may still be `running` in the database, because
-its end could not be written."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +34,7 @@ class RunRow:
     """A row of the table `runs`: one command that was started.
 
     `status` is `running`, `complete`, `failed` or `interrupted`. A running command whose process is dead counts as
-    interrupted.
+    interrupted. `seen` is its newest sign of life, seconds since 1970, 0 if it has ended.
     """
 
     id: str
@@ -59,26 +46,29 @@ class RunRow:
     total: int
     message: str
     host: str
-    pid: int
     started: str
     finished: str | None
-    heartbeat: float
     git_commit: str
+    seen: float
 
 
-def _row_of(row: Any) -> RunRow:
-    if row.host != socket.gethostname():
-        is_live = time.time() - row.heartbeat < STALE_SECONDS
-    else:
-        is_live = row.id in _open if row.pid == os.getpid() else is_alive(row.pid, row.heartbeat)
-    status = INTERRUPTED if row.status == RUNNING and not is_live else row.status
-    return RunRow(**{**row._mapping, "command": tuple(row.command), "status": status})
+_SEEN = sa.select(sa.func.max(WORKERS.c.heartbeat)).where(WORKERS.c.run == RUNS.c.id).scalar_subquery().label("seen")
 
 
-def is_running(connection: sa.Connection, run: str) -> bool:
-    """Return whether the run with this id may still be working."""
-    row = connection.execute(sa.select(RUNS).where(RUNS.c.id == run)).first()
-    return row is not None and _row_of(row).status == RUNNING
+def _rows(database: Database, connection: sa.Connection, query: sa.Select[Any]) -> list[RunRow]:
+    alive, rows = set(living(database, connection).values()), []
+    for row in connection.execute(query):
+        status = INTERRUPTED if row.status == RUNNING and row.id not in alive else row.status
+        rows.append(
+            RunRow(**{**row._mapping, "command": tuple(row.command), "status": status, "seen": row.seen or 0.0})
+        )
+    return rows
+
+
+def running(database: Database, connection: sa.Connection, kind: str, name: str) -> list[RunRow]:
+    """Return the living commands that make a study or an artifact."""
+    same = RUNS.c.kind == kind, RUNS.c.name == name, RUNS.c.status == RUNNING
+    return [row for row in _rows(database, connection, sa.select(RUNS, _SEEN).where(*same)) if row.status == RUNNING]
 
 
 def run_rows(database: Database, kind: str | None = None, name: str | None = None) -> list[RunRow]:
@@ -89,18 +79,18 @@ def run_rows(database: Database, kind: str | None = None, name: str | None = Non
         kind: Only runs of this kind; None for all.
         name: Only runs that made this study or artifact; None for all.
     """
-    query = sa.select(RUNS).order_by(RUNS.c.started.desc(), RUNS.c.heartbeat.desc(), RUNS.c.id.desc())
+    query = sa.select(RUNS, _SEEN).order_by(RUNS.c.started.desc(), RUNS.c.id.desc())
     query = query if kind is None else query.where(RUNS.c.kind == kind)
     query = query if name is None else query.where(RUNS.c.name == name)
     with database.reading() as connection:
-        return list(map(_row_of, connection.execute(query)))
+        return _rows(database, connection, query)
 
 
 def time_left(row: RunRow) -> str:
     """Return the estimated remaining time of a running command, such as `about 3 min left`. Empty if unknown."""
     if row.status != RUNNING or not 0 < row.done < row.total:
         return ""
-    return left(row.heartbeat - datetime.fromisoformat(row.started).timestamp(), row.done, row.total)
+    return left(row.seen - datetime.fromisoformat(row.started).timestamp(), row.done, row.total)
 
 
 def time_of(database: Database, kind: str, command: Sequence[str], units: int = 0) -> str:
@@ -158,19 +148,19 @@ def pulse(database: Database) -> tuple[str, bool]:
     """
     studies = sa.select(sa.func.count()).select_from(STUDIES).scalar_subquery()
     newest = sa.select(sa.func.max(EPISODES.c.id)).scalar_subquery()
-    facts = sa.select(sa.func.count(), sa.func.max(RUNS.c.heartbeat), studies, newest).select_from(RUNS)
+    beat = sa.select(sa.func.max(WORKERS.c.heartbeat)).scalar_subquery()
+    facts = sa.select(sa.func.count(), beat, studies, newest).select_from(RUNS)
     with database.reading() as connection:
-        rows = map(_row_of, connection.execute(sa.select(RUNS).where(RUNS.c.status == RUNNING)))
-        running = [row.id for row in rows if row.status == RUNNING]
-        return "/".join(map(str, [*connection.execute(facts).one(), *running])), bool(running)
+        rows = _rows(database, connection, sa.select(RUNS, _SEEN).where(RUNS.c.status == RUNNING))
+        alive = [row.id for row in rows if row.status == RUNNING]
+        return "/".join(map(str, [*connection.execute(facts).one(), *alive])), bool(alive)
 
 
-class Run:
+class Run(Presence):
     """Writes the database row of a command, from its start to its end. Use it in a `with` statement.
 
-    A thread updates the row every few seconds (a heartbeat), so that others see that the command is alive. The row is
-    deleted if the command ends with a UsageError. It is also deleted if the command made nothing because its input
-    cannot be read (a CheckpointError).
+    The row is deleted if the command ends with a UsageError. It is also deleted if the command made nothing because its
+    input cannot be read (a CheckpointError).
 
     Args:
         database: Where the row is written.
@@ -179,10 +169,6 @@ class Run:
         command: Command-line arguments (without `kerv`) that resume the command. If empty, `current_command()`.
         total: Number of steps or episodes.
         alone: Whether to refuse to start while another process makes the same study or artifact.
-
-    Raises:
-        UsageError: Another process is making the same study or artifact.
-        StorageError: The database is not writable.
     """
 
     def __init__(
@@ -194,35 +180,27 @@ class Run:
         total: int = 0,
         alone: bool = True,
     ) -> None:
-        self.database, self.kind, self.name, self.alone = database, kind, name, alone
-        self.command = list(command) or current_command()
         self.id = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}-{secrets.token_hex(3)}"
+        super().__init__(database, self.id)
+        self.kind, self.name, self.alone = kind, name, alone
+        self.command = list(command) or current_command()
         self.total, self.done = total, 0
-        self._ended = threading.Event()
-        self._heart = threading.Thread(target=self._keep_beating, daemon=True)
 
-    def __enter__(self) -> Run:
-        host, pid = socket.gethostname(), os.getpid()
-        same = sa.and_(RUNS.c.kind == self.kind, RUNS.c.name == self.name, RUNS.c.status == RUNNING)
-        with self.database.writing() as connection:
-            for row in map(_row_of, connection.execute(sa.select(RUNS).where(same)).all()):
-                if row.status != RUNNING:
-                    connection.execute(sa.update(RUNS).where(RUNS.c.id == row.id).values(status=row.status))
-                elif self.alone and (row.host, row.pid) != (host, pid):
-                    raise UsageError(
-                        f"{self.kind} {self.name} is being made by process {row.pid} on {row.host} since "
-                        f"{row.started[:16]}: wait for it, or choose another name"
-                    )
-            connection.execute(
-                sa.insert(RUNS).values(
-                    id=self.id, kind=self.kind, name=self.name, command=self.command, status=RUNNING, done=0,
-                    total=self.total, message="", host=host, pid=pid, started=now(), heartbeat=time.time(),
-                    git_commit=git_commit(),
-                )
-            )  # fmt: skip
-        _open.add(self.id)
-        self._heart.start()
-        return self
+    def _begin_in(self, connection: sa.Connection) -> None:
+        others = running(self.database, connection, self.kind, self.name)
+        if self.alone and others:
+            whose = f"on {others[0].host} since {others[0].started[:16]}"
+            raise UsageError(f"{self.kind} {self.name} is being made {whose}: wait for it, or choose another name")
+        same = RUNS.c.kind == self.kind, RUNS.c.name == self.name, RUNS.c.status == RUNNING
+        dead = sa.update(RUNS).where(*same, RUNS.c.id.not_in([row.id for row in others]))
+        connection.execute(dead.values(status=INTERRUPTED))
+        connection.execute(
+            sa.insert(RUNS).values(
+                id=self.id, kind=self.kind, name=self.name, command=self.command, status=RUNNING, done=0,
+                total=self.total, message="", host=socket.gethostname(), started=now(), git_commit=git_commit(),
+            )
+        )  # fmt: skip
+        super()._begin_in(connection)
 
     def beat(self, done: int, total: int | None = None) -> None:
         """Store the progress, which the next heartbeat writes. If `total` changes, it is written at once.
@@ -234,39 +212,40 @@ class Run:
         is_new = total not in (None, self.total)
         self.done, self.total = done, self.total if total is None else total
         if is_new:
-            self._update()
+            with self.database.writing() as connection:
+                self.beat_in(connection)
 
-    def _keep_beating(self) -> None:
-        while not self._ended.wait(BEAT_SECONDS):
-            with contextlib.suppress(KervError):  # the command itself will meet the same error and report it
-                self._update()
+    def beat_in(self, connection: sa.Connection) -> None:
+        """Write a sign of life and the progress, in a transaction."""
+        super().beat_in(connection)
+        progress = sa.update(RUNS).where(RUNS.c.id == self.id).values(done=self.done, total=self.total)
+        connection.execute(progress)
 
-    def _update(self, **values: Any) -> None:
-        values |= {"done": self.done, "total": self.total, "heartbeat": time.time()}
+    def _end(self, **values: Any) -> None:
         with self.database.writing() as connection:
-            connection.execute(sa.update(RUNS).where(RUNS.c.id == self.id).values(**values))
+            ended = {"done": self.done, "total": self.total, "finished": now(), **values}
+            connection.execute(sa.update(RUNS).where(RUNS.c.id == self.id).values(**ended))
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._ended.set()
-        self._heart.join()
-        _open.discard(self.id)
+    def __exit__(self, *error: object) -> None:
+        self._stop()
+        raised = error[1]
         try:
-            if self._was_refused(error):  # nothing was done: an earlier row is still the one to resume
+            if self._was_refused(raised):  # nothing was done: an earlier row is still the one to resume
                 with self.database.writing() as connection:
                     connection.execute(sa.delete(RUNS).where(RUNS.c.id == self.id))
-            elif error is None:
+            elif raised is None:
                 self.done = self.total or self.done
-                self._update(status=COMPLETE, finished=now())
+                self._end(status=COMPLETE)
             else:
-                status = INTERRUPTED if isinstance(error, Interrupted | KeyboardInterrupt) else FAILED
-                self._update(status=status, message=" ".join(str(error).split())[:500], finished=now())
+                status = INTERRUPTED if isinstance(raised, Interrupted | KeyboardInterrupt) else FAILED
+                self._end(status=status, message=" ".join(str(raised).split())[:500])
         except StorageError:
-            if error is None:  # otherwise show the first error
+            if raised is None:  # otherwise show the first error
                 raise
+        finally:
+            super().__exit__(*error)
 
-    def _was_refused(self, error: BaseException | None) -> bool:
+    def _was_refused(self, error: object) -> bool:
         """Return whether the command was refused: by a UsageError, or by a CheckpointError before it made anything."""
         if not isinstance(error, CheckpointError):
             return isinstance(error, UsageError)

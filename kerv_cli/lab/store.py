@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import functools
-import itertools
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +15,6 @@ from kerv_cli.base.config import groups
 from kerv_cli.base.errors import UsageError, did_you_mean
 from kerv_cli.base.limits import check_label
 from kerv_cli.base.paths import check_name
-from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.episodes.identity import Setting
 from kerv_cli.lab.database import (
     BLOCKS,
@@ -28,49 +25,27 @@ from kerv_cli.lab.database import (
     RUNS,
     SETTINGS,
     STUDIES,
+    UNFINISHED,
     WANTED,
     Damaged,
     Database,
     measures_in,
     now,
 )
-from kerv_cli.lab.plan import NEVER, Block, Episode, Key, StoredEpisode, blocks_of, grouped, split
-from kerv_cli.lab.runs import Run, run_rows
+from kerv_cli.lab.plan import Episode, Key, StoredEpisode
+from kerv_cli.lab.runs import run_rows
 
 if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-SWEEP, ROLLOUT = "sweep", "rollout"
-"""Kinds of studies, made by `kerv sweep` and `kerv rollout`."""
-_FOLDERS = {SWEEP: "studies", ROLLOUT: "rollouts"}
+SWEEP, ROLLOUT, IMPORT = "sweep", "rollout", "import"
+"""Kinds of studies, made by `kerv sweep`, `kerv rollout` and `kerv runs import`."""
+_FOLDERS = {SWEEP: "studies", ROLLOUT: "rollouts", IMPORT: "studies"}
 _AT_ONCE = 500  # most values in one SQL IN (…)
 _ROWS = 2000  # rows of a frame that are read at a time
 ABOUT = ("title", "baseline", "axis", "note", "block", "machines")
 """Fields of a `Study` that are stored as one JSON value."""
-
-
-@dataclass(frozen=True)
-class ImportedEpisode:
-    """An episode from another database, to be imported.
-
-    Attributes:
-        episode: Setting, task and seed in the study.
-        row: Columns of the table `episodes`, as far as they are known.
-        decodes: Decodes of the episode, a table with the columns of rows.DECODE_SCHEMA.
-        block: Id of the block (episodes that one process ran) in which it ran.
-        about: Machine and versions that ran the block.
-        run: Id of the run (the command that ran it). If empty, the run that imports the episode is stored.
-        seeds: Seeds of the block, as `seeds_text` writes them.
-    """
-
-    episode: Episode
-    row: Mapping[str, Any]
-    decodes: pa.Table
-    block: str
-    about: Mapping[str, Any]
-    run: str = ""
-    seeds: str = ""
 
 
 def _same_episode() -> sa.ColumnElement[bool]:
@@ -86,8 +61,7 @@ def _same_episode() -> sa.ColumnElement[bool]:
 class Study:
     """A comparison of several settings, in a database.
 
-    `Study(database, name)` alone names a study: `load` returns it with its settings and episodes. `plan` says which of
-    its episodes exist and which are missing.
+    `Study(database, name)` alone names a study: `load` returns it with its settings and episodes.
 
     Attributes:
         database: The database.
@@ -101,11 +75,6 @@ class Study:
         note: A sentence printed in the report.
         block: Number of seeds in a block, which one process runs. For each of these seeds it runs all settings.
         machines: Names of cost profiles of other machines, on which the report estimates the speeds.
-        existing: Episodes that the database has, with their rows.
-        missing: Episodes to run, each with the reason in a few words, such as `new seeds`.
-        newest: Largest row number among the stored episodes. Rows with larger numbers are from later sweeps.
-        runtime: Executor, workers and device.
-        command: Command-line arguments (without `kerv`) that resume the study.
 
     Raises:
         UsageError: The name is not a plain folder name.
@@ -122,11 +91,6 @@ class Study:
     note: str = ""
     block: int = 5
     machines: Sequence[str] = ()
-    existing: Mapping[Episode, StoredEpisode] = field(default_factory=dict)
-    missing: Mapping[Episode, str] = field(default_factory=dict)
-    newest: int = 0
-    runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
-    command: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_name(self.name, "study name")
@@ -143,22 +107,6 @@ class Study:
     def tasks(self) -> list[str]:
         """Names of the tasks, in order."""
         return list(dict.fromkeys(map(attrgetter("task"), self.episodes)))
-
-    @functools.cached_property
-    def to_run(self) -> list[Episode]:
-        """The episodes to run. An episode that several labels share runs once."""
-        return list({one.key: one for one in self.missing}.values())
-
-    @functools.cached_property
-    def blocks(self) -> list[Block]:
-        """The episodes to run, grouped into blocks. One process runs a block. Blocks are ordered by first episode."""
-        return blocks_of(self.to_run, self.block, self.runtime.workers)
-
-    @property
-    def device(self) -> str:
-        """Device of the episodes to run. Empty if they need different devices."""
-        devices = {str(one.setting.settings["runtime"]["device"]) for one in self.to_run}
-        return devices.pop() if len(devices) == 1 else ""
 
     @property
     def root(self) -> Path:
@@ -234,108 +182,6 @@ class Study:
             settings, episodes = stored_settings(connection, row.id)
             return Study(self.database, self.name, row.kind, tuple(settings.values()), episodes, **row.about)
 
-    def plan(
-        self,
-        rerun: str = NEVER,
-        since: str = "",
-        runtime: RuntimeSettings | None = None,
-        command: Sequence[str] = (),
-    ) -> Study:
-        """Compare the episodes with the database. Return the study with its existing and missing episodes.
-
-        Args:
-            rerun: Which existing episodes to run again: NEVER or ALL (`lab/plan.py`).
-            since: Used only with ALL, if an interrupted command is resumed: the time at which that command began (ISO
-                8601). Episodes of blocks that began then or later do not run again, because that command ran them. If
-                empty, all episodes run again.
-            runtime: Executor, workers and device.
-            command: Command-line arguments (without `kerv`) that resume the study.
-        """
-        stored = self.stored()
-        existing, missing = split(self.episodes, self.block, stored, rerun, since, self._earlier())
-        newest = max((row.id for row in itertools.chain(*stored.values())), default=0)
-        runtime, command = runtime or RuntimeSettings(), tuple(command)
-        return replace(self, existing=existing, missing=missing, newest=newest, runtime=runtime, command=command)
-
-    def stored(self, newer_than: int = 0, block: Block | None = None) -> dict[Key, list[StoredEpisode]]:
-        """Return the stored episodes that the study may reuse, by `Episode.key`.
-
-        Sweeps do not reuse episodes of rollouts: no other setting took turns with them, so their times cannot be
-        compared.
-
-        Args:
-            newer_than: Return only rows with a larger row number.
-            block: Return only rows of this block's settings, tasks and seeds. If None, rows of all the settings.
-        """
-        stored: dict[Key, list[StoredEpisode]] = {}
-        columns = (
-            EPISODES.c.work, EPISODES.c.task, EPISODES.c.seed, EPISODES.c.id, EPISODES.c.success,
-            EPISODES.c.wall_seconds, BLOCKS.c.id, BLOCKS.c.run, BLOCKS.c.started, BLOCKS.c.seeds,
-        )  # fmt: skip
-        works = {setting.work for setting in (block or self).settings}
-        query = sa.select(*columns).join(BLOCKS, EPISODES.c.block == BLOCKS.c.id)
-        query = query.where(EPISODES.c.id > newer_than, EPISODES.c.work.in_(works))
-        if block is not None:
-            tasks = {one.task for one in block.episodes}
-            query = query.where(EPISODES.c.task.in_(tasks), EPISODES.c.seed.in_(block.seeds))
-        if self.kind != ROLLOUT:
-            query = query.outerjoin(RUNS, RUNS.c.id == BLOCKS.c.run)
-            query = query.where(sa.func.coalesce(RUNS.c.kind, "") != ROLLOUT)
-        with self.database.reading() as connection:
-            for work, task, seed, *row in connection.execute(query.order_by(EPISODES.c.id)):
-                stored.setdefault((work, task, seed), []).append(StoredEpisode(*row))
-        return stored
-
-    def _earlier(self) -> dict[str, Setting]:
-        """Return, for each label, the newest stored setting that has episodes."""
-        ran = sa.select(WANTED.c.setting_id).where(WANTED.c.episode_id.is_not(None))
-        query = sa.select(SETTINGS).where(SETTINGS.c.label.in_(self.labels), SETTINGS.c.id.in_(ran))
-        with self.database.reading() as connection:
-            rows = connection.execute(query.order_by(SETTINGS.c.id))
-            return {row.label: setting_of(row) for row in rows}
-
-    def save(self) -> None:
-        """Write the study's settings and its list of planned episodes.
-
-        A study that is stored already may list episodes of tasks that are not in this plan. These episodes stay in the
-        list if their setting and the baseline are unchanged, and this plan has their seeds. So sweeps of
-        one study over different tasks give one report.
-        """
-        with self.database.writing() as connection:
-            self.save_in(connection)
-
-    def save_in(self, connection: sa.Connection) -> int:
-        """Do the same as `save`, but in the caller's transaction. Return the study's row number."""
-        about = {name: getattr(self, name) for name in ABOUT}
-        row = connection.execute(sa.select(STUDIES).where(STUDIES.c.name == self.name)).first()
-        if row is None:
-            new = sa.insert(STUDIES).values(name=self.name, kind=self.kind, created=now(), about=about)
-            row = connection.execute(new.returning(STUDIES)).one()
-        kept = self.labels if row.about["baseline"] == self.baseline else []
-        mine = SETTINGS.c.study_id == row.id
-        connection.execute(sa.delete(SETTINGS).where(mine, SETTINGS.c.label.not_in(kept)))
-        connection.execute(sa.update(STUDIES).where(STUDIES.c.id == row.id).values(about=about))
-        ids, of_label = dict[str, int](), grouped(self.episodes, attrgetter("setting.label"))
-        for position, setting in enumerate(self.settings):
-            ids[setting.label] = _save_setting(connection, row.id, position, setting)
-            planned = of_label.get(setting.label, [])
-            seeds = list(map(attrgetter("seed"), planned))
-            still = sa.and_(
-                WANTED.c.task.not_in(self.tasks),
-                WANTED.c.seed.between(min(seeds, default=0), max(seeds, default=-1)),
-            )
-            of_setting = WANTED.c.setting_id == ids[setting.label]
-            connection.execute(sa.delete(WANTED).where(of_setting, sa.not_(still)))
-        last = sa.select(sa.func.max(WANTED.c.position)).where(WANTED.c.setting_id.in_(ids.values()))
-        rows, first = [], (connection.scalar(last) or 0) + 1
-        for position, one in enumerate(dict.fromkeys(self.episodes), first):
-            stored = self.existing.get(one)
-            key = {"setting_id": ids[one.setting.label], "task": one.task, "seed": one.seed}
-            rows.append({**key, "position": position, "episode_id": stored and stored.id})
-        if rows:
-            connection.execute(sa.insert(WANTED), rows)
-        return int(row.id)
-
     def counts(self) -> tuple[int, int]:
         """Return how many of the study's planned episodes have been run, and how many episodes are planned."""
         with self.database.reading() as connection:
@@ -390,9 +236,9 @@ class Study:
                 .where(STUDIES.c.name == self.name, *([] if run is None else [BLOCKS.c.run == run]))
                 .order_by(WANTED.c.position)
             )  # fmt: skip
-            found = connection.execution_options(yield_per=_ROWS).execute(query)
+            found = connection.execute(query)
             # part by part: the rows as Python objects take ten times the frame's memory
-            parts = [pd.DataFrame.from_records(rows, columns=list(found.keys())) for rows in found.partitions()]
+            parts = [pd.DataFrame.from_records(rows, columns=list(found.keys())) for rows in found.partitions(_ROWS)]
             if not parts:
                 return pd.DataFrame()
             frame = pd.concat(parts, ignore_index=True)
@@ -442,57 +288,6 @@ class Study:
                 tables.append(table.append_column("episode", pa.array([index] * table.num_rows, pa.int64())))
         return pa.concat_tables(tables, promote_options="default")
 
-    def add(self, episodes: Iterable[ImportedEpisode], command: Sequence[str]) -> None:
-        """Write the study and its episodes, which were run elsewhere, in one transaction.
-
-        Args:
-            episodes: The episodes that were run, with their results.
-            command: Command-line arguments (without `kerv`) of the import.
-        """
-        from kerv_cli.episodes.rows import seconds_blob, table_blob
-
-        with Run(self.database, self.kind, self.name, command) as record, self.database.writing() as connection:
-            self.save_in(connection)
-            for one in episodes:
-                block = {"id": one.block, "seeds": one.seeds, "started": one.row.get("started") or now(),
-                         "about": one.about, "run": one.run or record.id}  # fmt: skip
-                seconds = seconds_blob(one.decodes["seconds"].to_pylist())
-                row = {"order": 0, "started": "", **one.row, "decode_seconds": seconds}
-                self.write(connection, one.episode, block, row, table_blob(one.decodes))
-
-    def write(
-        self, connection: sa.Connection, one: Episode, block: Mapping[str, Any], row: Mapping[str, Any], decodes: bytes
-    ) -> None:
-        """Write an episode that has been run, and link it to the study. Rows that exist already are not changed.
-
-        Args:
-            connection: The database, in a transaction.
-            one: The episode.
-            block: Row of its block.
-            row: Columns of the table `episodes` whose values are neither in `one` nor in `block`.
-            decodes: The episode's decodes, as the bytes of a Parquet file.
-        """
-        work, task, seed = one.key
-        key = {"work": work, "task": task, "seed": seed, "block": block["id"]}
-        number = connection.scalar(sa.select(EPISODES.c.id).filter_by(**key))
-        if number is None:
-            if connection.scalar(sa.select(BLOCKS.c.id).filter_by(id=block["id"])) is None:
-                connection.execute(sa.insert(BLOCKS).values(**block))
-            new = sa.insert(EPISODES).values({**row, **key}).returning(EPISODES.c.id)
-            number = connection.execute(new).scalar_one()
-            connection.execute(sa.insert(DECODES).values(episode_id=number, parquet=decodes))
-        self.update(connection, one, episode_id=number, error=None)
-
-    def update(self, connection: sa.Connection, one: Episode, **values: Any) -> None:
-        """Change this study's rows of an episode in the table WANTED (planned episodes).
-
-        An episode has several rows if settings with different labels have the same hash `work`, and so share it.
-        """
-        settings = sa.select(SETTINGS.c.id).join(STUDIES).where(STUDIES.c.name == self.name)
-        settings = settings.where(SETTINGS.c.work == one.setting.work)
-        same = sa.update(WANTED).filter_by(task=one.task, seed=one.seed)
-        connection.execute(same.where(WANTED.c.setting_id.in_(settings)).values(**values))
-
     def remove(self) -> None:
         """Delete the study, and its episodes that no other study uses.
 
@@ -511,33 +306,122 @@ class Study:
             connection.execute(sa.delete(BLOCKS).where(BLOCKS.c.id.not_in(full)))
 
 
-def _save_setting(connection: sa.Connection, study: int, position: int, setting: Setting) -> int:
-    """Write a setting, and return its id.
-
-    A stored setting with the same label but another hash `work` is deleted first, together with its list of episodes.
+def write_episode(
+    connection: sa.Connection, key: Key, block: Mapping[str, Any], row: Mapping[str, Any], decodes: bytes
+) -> int:
+    """Write an episode that has been run, unless it is there already. Return its row number.
 
     Args:
         connection: The database, in a transaction.
-        study: Id of the study.
-        position: Place of the setting in the study.
-        setting: The setting.
+        key: Key of the episode.
+        block: Row of its block.
+        row: Columns of the table `episodes` whose values are neither in `key` nor in `block`.
+        decodes: The episode's decodes, as the bytes of a Parquet file.
     """
-    values = {
-        "position": position,
-        "name": setting.name,
-        "method": str(setting.settings["method"]),
-        "varies": dict(setting.varies),
-        "overrides": list(setting.overrides),
-        "settings": dict(setting.settings),
-        "identity": dict(setting.identity),
-    }
-    same = sa.and_(SETTINGS.c.study_id == study, SETTINGS.c.label == setting.label)
-    connection.execute(sa.delete(SETTINGS).where(same, SETTINGS.c.work != setting.work))
-    number = connection.scalar(sa.update(SETTINGS).where(same).values(**values).returning(SETTINGS.c.id))
+    own = dict(zip(("work", "task", "seed"), key, strict=True)) | {"block": block["id"]}
+    number = connection.scalar(sa.select(EPISODES.c.id).filter_by(**own))
     if number is None:
-        new = sa.insert(SETTINGS).values(study_id=study, label=setting.label, work=setting.work, **values)
-        number = connection.execute(new.returning(SETTINGS.c.id)).scalar_one()
+        if connection.scalar(sa.select(BLOCKS.c.id).filter_by(id=block["id"])) is None:
+            connection.execute(sa.insert(BLOCKS).values(**block))
+        number = connection.execute(sa.insert(EPISODES).values({**row, **own}).returning(EPISODES.c.id)).scalar_one()
+        connection.execute(sa.insert(DECODES).values(episode_id=number, parquet=decodes))
     return int(number)
+
+
+def rows_of(connection: sa.Connection, name: str) -> Sequence[Any]:
+    """Return the rows of a study in the table WANTED, each with the label and the hash of its setting."""
+    columns = SETTINGS.c.label, SETTINGS.c.work, WANTED, sa.case((UNFINISHED, True), else_=False).label("is_unfinished")
+    query = sa.select(*columns).select_from(PLANNED).where(STUDIES.c.name == name).order_by(WANTED.c.position)
+    return connection.execute(query).all()
+
+
+def stored_episodes(
+    connection: sa.Connection, kind: str, works: Iterable[str], tasks: Iterable[str] = (), seeds: Iterable[int] = ()
+) -> dict[Key, list[StoredEpisode]]:
+    """Return the stored episodes that a study may reuse, by `Episode.key`, each list with the oldest first.
+
+    Sweeps do not reuse episodes of rollouts: no other setting took turns with them, so their times cannot be compared.
+
+    Args:
+        connection: The database.
+        kind: Kind of the study.
+        works: Hashes of the settings.
+        tasks: Only episodes of these tasks; empty for all.
+        seeds: Only episodes with these seeds; empty for all.
+    """
+    columns = EPISODES.c["work", "task", "seed", "id"], BLOCKS.c["id", "started", "seeds"]
+    query = sa.select(*columns[0], *columns[1]).join(BLOCKS, EPISODES.c.block == BLOCKS.c.id)
+    wanted: dict[Any, set[Any]] = {
+        EPISODES.c.work: set(works),
+        EPISODES.c.task: set(tasks),
+        EPISODES.c.seed: set(seeds),
+    }
+    for column, values in wanted.items():
+        if values:
+            query = query.where(column.in_(values))
+    if kind != ROLLOUT:
+        query = query.outerjoin(RUNS, RUNS.c.id == BLOCKS.c.run)
+        query = query.where(sa.func.coalesce(RUNS.c.kind, "") != ROLLOUT)
+    stored: dict[Key, list[StoredEpisode]] = {}
+    for work, task, seed, *row in connection.execute(query.order_by(EPISODES.c.id)):
+        stored.setdefault((work, task, seed), []).append(StoredEpisode(*row))
+    return stored
+
+
+def study_row(connection: sa.Connection, study: Study) -> tuple[int, bool]:
+    """Write a study's row. Return its number, and whether its baseline was the same before."""
+    about = {name: getattr(study, name) for name in ABOUT}
+    row = connection.execute(sa.select(STUDIES).where(STUDIES.c.name == study.name)).first()
+    if row is None:
+        new = sa.insert(STUDIES).values(name=study.name, kind=study.kind, created=now(), about=about)
+        return int(connection.execute(new.returning(STUDIES.c.id)).scalar_one()), True
+    connection.execute(sa.update(STUDIES).where(STUDIES.c.id == row.id).values(about=about))
+    return int(row.id), row.about["baseline"] == study.baseline
+
+
+def save_settings(
+    connection: sa.Connection, study: Study, number: int, is_shared: bool, is_same_baseline: bool
+) -> dict[str, int]:
+    """Write a study's settings, and return their ids by label.
+
+    Unless somebody runs the study, settings that it has no longer are deleted with their rows, and so is a setting that
+    has another hash now. All are, if the baseline is another.
+
+    Args:
+        connection: The database, in a transaction.
+        study: The study.
+        number: Its row number.
+        is_shared: Whether somebody runs the study.
+        is_same_baseline: Whether its baseline was the same before.
+    """
+    of_study, ids = SETTINGS.c.study_id == number, {}
+    stored = sa.select(SETTINGS.c.label, SETTINGS.c.work).where(of_study)
+    works: dict[str, str] = dict(connection.execute(stored).all())
+    if not is_shared:
+        kept = [one.label for one in study.settings if works.get(one.label) == one.work] if is_same_baseline else []
+        connection.execute(sa.delete(SETTINGS).where(of_study, SETTINGS.c.label.not_in(kept)))
+    for position, setting in enumerate(study.settings):
+        if is_shared and works.get(setting.label, setting.work) != setting.work:
+            raise UsageError(
+                f"study {study.name} is running, with other settings of {setting.label}: wait until it has ended, or "
+                "write a study of another name"
+            )
+        values = {
+            "position": position,
+            "name": setting.name,
+            "method": str(setting.settings["method"]),
+            "varies": dict(setting.varies),
+            "overrides": list(setting.overrides),
+            "settings": dict(setting.settings),
+            "identity": dict(setting.identity),
+        }
+        same = sa.update(SETTINGS).where(of_study, SETTINGS.c.label == setting.label)
+        found = connection.scalar(same.values(**values).returning(SETTINGS.c.id))
+        if found is None:
+            new = sa.insert(SETTINGS).values(study_id=number, label=setting.label, work=setting.work, **values)
+            found = connection.execute(new.returning(SETTINGS.c.id)).scalar_one()
+        ids[setting.label] = int(found)
+    return ids
 
 
 def setting_of(row: Any) -> Setting:

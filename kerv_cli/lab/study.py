@@ -1,97 +1,143 @@
-"""Plan a study and run it: `plan` finds the missing episodes, `run` runs them and follows their progress."""
+"""Plan a study and save its plan: which episodes are in the database, which must run, and in which blocks."""
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import re
 import secrets
-import time
-from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
+from typing import Any
 
 import sqlalchemy as sa
 
-from kerv_cli.base.durations import count
-from kerv_cli.base.errors import Interrupted, KervError, StorageError, UsageError
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.paths import check_writable
 from kerv_cli.base.runtime import set_up
+from kerv_cli.base.settings import RuntimeSettings
+from kerv_cli.episodes import policy
 from kerv_cli.episodes.identity import Setting
-from kerv_cli.episodes.policy import check
 from kerv_cli.episodes.resolve import ResolvedStudy, located
-from kerv_cli.episodes.runner import close_worlds
-from kerv_cli.lab.database import EPISODES, PLANNED, SETTINGS, STUDIES, WANTED, Database
-from kerv_cli.lab.plan import ALL, Episode, all_episodes
-from kerv_cli.lab.runs import Run, interrupted
-from kerv_cli.lab.store import ABOUT, ROLLOUT, SWEEP, Study
-from kerv_cli.lab.work import (
-    BlockStarted,
-    EpisodeEnd,
-    EpisodeRunner,
-    Event,
-    OnEvent,
-    Prepare,
-    Queue,
-    Save,
-    SettingFailed,
-    Started,
-    load_per_core,
-    patiently,
-    work,
+from kerv_cli.lab.database import EPISODES, SETTINGS, STUDIES, UNFINISHED, WANTED, Database
+from kerv_cli.lab.plan import ALL, NEVER, Block, Episode, KnownRow, all_episodes, blocks_of, ordered_parts, split
+from kerv_cli.lab.presence import living
+from kerv_cli.lab.runs import interrupted, running
+from kerv_cli.lab.store import (
+    ABOUT,
+    SWEEP,
+    Study,
+    rows_of,
+    save_settings,
+    setting_of,
+    stored_episodes,
+    study_row,
 )
-from kerv_cli.lab.workers import Array, LocalWorkers, gpus_in_turn
 
-SLURM = "slurm"
-FOLLOW_SECONDS = 0.3
-"""Seconds between two queries of the database while other processes run the blocks."""
+_AT_ONCE = 500  # most values in one SQL IN (…)
 
 
-def plan(resolved: ResolvedStudy, database: Database, command: Sequence[str], kind: str = SWEEP) -> Study:
-    """Check the settings of a sweep or a rollout. Find out which episodes are in the database, and which must run.
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What a command will do for a study.
+
+    Attributes:
+        study: The study.
+        existing: Row numbers of the episodes that the database has.
+        missing: Episodes to run, each with the reason in a few words, such as `new seeds`.
+        anew: Whether to run all episodes again.
+        seen: Row numbers of the episodes that the study had when it was planned.
+        runtime: Workers and device.
+        command: Command-line arguments (without `kerv`) that resume the study.
+    """
+
+    study: Study
+    existing: Mapping[Episode, int]
+    missing: Mapping[Episode, str]
+    anew: bool = False
+    seen: frozenset[int] = frozenset()
+    runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
+    command: tuple[str, ...] = ()
+
+    @functools.cached_property
+    def to_run(self) -> list[Episode]:
+        """The episodes to run. An episode that several labels share runs once."""
+        return list({one.key: one for one in self.missing}.values())
+
+    @functools.cached_property
+    def blocks(self) -> list[Block]:
+        """The episodes to run, grouped into blocks. One process runs a block. Blocks are ordered by first episode."""
+        return blocks_of(self.to_run, self.study.block, self.runtime.workers or 1)
+
+    @property
+    def device(self) -> str:
+        """Device of the episodes to run. Empty if they need different devices."""
+        devices = {str(one.setting.settings["runtime"]["device"]) for one in self.to_run}
+        return devices.pop() if len(devices) == 1 else ""
+
+    @property
+    def is_elsewhere(self) -> bool:
+        """Whether this command starts no worker of its own."""
+        return _is_elsewhere(self.runtime)
+
+
+def _is_elsewhere(runtime: RuntimeSettings) -> bool:
+    return bool(runtime.launch) or not runtime.workers
+
+
+def check(resolved: ResolvedStudy) -> tuple[Setting, ...]:
+    """Check the settings of a sweep or a rollout. Return them with the hashes of their weights, the baseline first.
+
+    Raises:
+        UsageError: A setting cannot run.
+        CheckpointError: A setting's weights or data cannot be read.
+        StorageError: The results folder is not writable.
+    """
+    check_writable(str(resolved.first.results))
+    settings = []
+    for label, one in resolved.settings.items():
+        point, device = resolved.points[label], one.runtime.device
+        if _is_elsewhere(resolved.first.runtime):  # this machine may have no GPU
+            if device == "auto":
+                raise UsageError("runtime.device=auto: workers run elsewhere, name their device: cpu or cuda")
+            one.runtime.device = "cpu"
+        identity = policy.check(one)
+        one.runtime.device = device if _is_elsewhere(resolved.first.runtime) else set_up(one.runtime)[0]
+        plain = asdict(one)
+        del plain["task"]
+        settings.append(Setting(label, point.words, plain, identity, point.varies, point.name))
+    return tuple(sorted(settings, key=lambda setting: setting.label != resolved.study.baseline))
+
+
+def plan(
+    resolved: ResolvedStudy, settings: Sequence[Setting], database: Database, command: Sequence[str], kind: str = SWEEP
+) -> Plan:
+    """Find out which episodes of a sweep or a rollout are in the database, and which must run.
 
     Each call plans a new rollout, unless the same command was interrupted before. Then the rest of its newest rollout
     is planned.
 
     Args:
         resolved: The study with all its settings.
+        settings: What `check` returns.
         database: The database.
         command: Command-line arguments (without `kerv`) that resume the sweep or rollout.
         kind: SWEEP or ROLLOUT.
-
-    Raises:
-        UsageError: A setting cannot run, or there are too many episodes.
-        CheckpointError: A setting's weights or data cannot be read.
-        StorageError: The results folder is not writable.
     """
-    runtime, rerun, command = resolved.first.runtime, resolved.sweep.rerun, located(command)
-    if kind == SWEEP and runtime.detach and runtime.executor != SLURM:
-        raise UsageError("runtime.detach=true is for clusters: add runtime.executor=slurm")
-    check_writable(str(database.results))
-    about, settings = resolved.study, []
-    for label, one in resolved.settings.items():
-        point, identity = resolved.points[label], check(one)
-        if one.runtime.executor != SLURM:
-            one.runtime.device, _ = set_up(one.runtime)
-        elif one.runtime.device == "auto":  # the nodes choose their device: this machine may have no GPU
-            one.runtime.device = "cuda" if one.runtime.executor_options.gpus else "cpu"
-        plain = asdict(one)
-        del plain["task"]
-        settings.append(Setting(label, point.words, plain, identity, point.varies, point.name))
-    settings.sort(key=lambda setting: setting.label != about.baseline)
+    about, runtime, rerun, command = resolved.study, resolved.first.runtime, resolved.sweep.rerun, located(command)
     episodes = all_episodes(settings, resolved.tasks, about.block)
     own = {name: getattr(about, name) for name in ABOUT}
     study = Study(database, about.name, kind, tuple(settings), episodes, **own)
     if kind == SWEEP:
         study.check_source(command)
-        begun = interrupted(database, kind, command, study.name) if rerun == ALL else None
     else:
         begun = interrupted(database, kind, command)
         done, total = replace(study, name=begun.name).counts() if begun else (0, 0)
         begun = begun if 0 < done < total else None
         study = replace(study, name=begun.name if begun else new_name(study))
-        rerun, runtime = ALL, replace(runtime, workers=1, executor="local")
-    return study.plan(rerun, begun.started if begun else "", runtime, command)
+        rerun, runtime = NEVER if begun else ALL, replace(runtime, workers=1, launch="")
+    return plan_study(study, rerun, runtime, command)
 
 
 def new_name(study: Study) -> str:
@@ -101,267 +147,188 @@ def new_name(study: Study) -> str:
     return f"{name}-{secrets.token_hex(2)}" if replace(study, name=name).exists else name
 
 
-@dataclass
-class Outcome:
-    """Result of `study.run`. Each episode of the study is in exactly one of the first three lists.
-
-    But if workers of a cluster go on without this command (`detached`), the missing episodes are in none of the lists.
-
-    Attributes:
-        done: Episodes that this command planned and that were run.
-        reused: Episodes that were in the database already, or that another command planned and ran.
-        failed: Settings that failed, with their episodes.
-        seconds: Wall time.
-        detached: Says which workers of a cluster run the missing episodes. Empty if no cluster runs them.
-    """
-
-    done: list[Episode] = field(default_factory=list)
-    reused: list[Episode] = field(default_factory=list)
-    failed: list[SettingFailed] = field(default_factory=list)
-    seconds: float = 0.0
-    detached: str = ""
-
-
-def run(study: Study, on_event: OnEvent = lambda event: None, *, save: Save = lambda *_: None) -> Outcome:
-    """Run the missing episodes of a plan. Each episode is saved in the database as soon as it ends.
+def plan_study(
+    study: Study, rerun: str = NEVER, runtime: RuntimeSettings | None = None, command: Sequence[str] = ()
+) -> Plan:
+    """Compare a study's episodes with the database.
 
     Args:
-        study: The study with its plan.
-        on_event: Called with each event, to show progress.
-        save: Writes the recording (.rrd file) of an episode. The default writes nothing.
+        study: The study.
+        rerun: Which existing episodes to run again: NEVER or ALL.
+        runtime: Workers and device.
+        command: Command-line arguments (without `kerv`) that resume the study.
+    """
+    with study.database.reading() as connection:
+        known: dict[Episode, KnownRow] = {}
+        of_label = {setting.label: setting for setting in study.settings}
+        for row in rows_of(connection, study.name):
+            setting = of_label.get(row.label)
+            if setting is not None and setting.work == row.work:
+                known[Episode(setting, row.task, row.seed)] = KnownRow(row.episode_id, row.anew)
+        stored = stored_episodes(connection, study.kind, {setting.work for setting in study.settings})
+        earlier = _earlier(connection, study.labels)
+    existing, missing = split(study.episodes, study.block, stored, known, rerun, earlier)
+    seen = frozenset(row.episode_id for row in known.values() if row.episode_id is not None)
+    return Plan(study, existing, missing, rerun == ALL, seen, runtime or RuntimeSettings(), tuple(command))
+
+
+def _earlier(connection: sa.Connection, labels: Sequence[str]) -> dict[str, Setting]:
+    """Return, for each label, the newest stored setting that has episodes."""
+    ran = sa.select(WANTED.c.setting_id).where(WANTED.c.episode_id.is_not(None))
+    query = sa.select(SETTINGS).where(SETTINGS.c.label.in_(labels), SETTINGS.c.id.in_(ran)).order_by(SETTINGS.c.id)
+    return {row.label: setting_of(row) for row in connection.execute(query)}
+
+
+def save(plan: Plan, run: str = "") -> None:
+    """Write a plan, in one transaction: the study's settings, its rows, and the blocks of what must run.
+
+    If nobody else runs the study, rows outside the plan are removed or lose their block. A row of another task stays if
+    its setting and the baseline are unchanged, and this plan has its seed: so sweeps over different tasks give one
+    report. If somebody runs the study, nothing is taken away, and new rows get blocks of their own. A row that finished
+    after planning keeps its episode.
+
+    Args:
+        plan: The plan.
+        run: Id of this command.
 
     Raises:
-        Interrupted: Ctrl-C was pressed.
-        KervError: An episode of a rollout failed.
-        StorageError: The disk is full or not writable.
+        UsageError: Somebody runs the study with other settings under one of the labels.
     """
-    is_rollout = study.kind == ROLLOUT
-
-    def forward(event: Event) -> None:
-        if isinstance(event, SettingFailed) and is_rollout:
-            raise event.error or KervError(event.reason)
-        on_event(event)
-
-    prepare = EpisodeRunner(study.rollouts, save)
-    try:
-        with Run(study.database, study.kind, study.name, study.command, len(study.to_run), is_rollout) as record:
-            try:
-                return run_blocks(study, prepare, record, forward)
-            except KeyboardInterrupt:
-                raise Interrupted(
-                    f"interrupted: {_kept(study)} of {study.name} are kept: run the same command to resume"
-                ) from None
-            finally:
-                close_worlds()
-    except Detached as detached:
-        return Outcome(reused=list(study.existing), detached=str(detached))
+    with plan.study.database.writing() as connection:
+        save_in(connection, plan, run)
 
 
-class Detached(Interrupted):
-    """The workers of a cluster go on without this command. The error's message names the workers."""
+def save_in(connection: sa.Connection, plan: Plan, run: str = "") -> int:
+    """Do the same as `save`, but in the caller's transaction. Return the study's row number."""
+    study = plan.study
+    is_shared = _somebody_runs(connection, study, run)
+    number, is_same_baseline = study_row(connection, study)
+    ids = save_settings(connection, study, number, is_shared, is_same_baseline)
+    before = {(row.setting_id, row.task, row.seed): row for row in rows_of(connection, study.name)}
+    vanished = _vanished(connection, plan.existing.values())
+    wanted = {(ids[one.setting.label], one.task, one.seed): one for one in study.episodes}
+    positions = _positions(wanted, before)
+    new, changed, moved = list[Any](), list[Any](), list[Any]()
+    to_run = dict[Episode, dict[str, Any]]()
+    for key, one in wanted.items():
+        row, linked = before.pop(key, None), plan.existing.get(one)
+        of_key = dict(zip(_KEY, key, strict=True))
+        if row is not None and _stays(row, linked, plan, is_shared):
+            if row.position != positions[key]:
+                moved.append({"of_" + name: value for name, value in (of_key | {"position": positions[key]}).items()})
+            continue
+        values = {**of_key, "study_id": number, "position": positions[key], "error": None, "block": None,
+                  "episode_id": None if linked in vanished else linked, "worker": None, "attempts": 0,
+                  "anew": plan.anew or (row is not None and row.anew)}  # fmt: skip
+        if values["episode_id"] is None:
+            to_run[one] = values
+        (new if row is None else changed).append(values)
+    _check_orders(study, to_run, is_shared)
+    last = connection.scalar(sa.select(sa.func.max(WANTED.c.block)).where(WANTED.c.study_id == number)) or 0
+    by_key = {one.key: one for one in to_run}
+    blocks = blocks_of(by_key.values(), study.block, plan.runtime.workers or 1)
+    block_of = {one.key: last + 1 + index for index, block in enumerate(blocks) for one in block.episodes}
+    for one, values in to_run.items():
+        values["block"] = block_of[one.key]
+    if not is_shared:
+        _take_away(connection, study, ids, before.values())
+    if new:
+        connection.execute(sa.insert(WANTED), new)
+    if changed:
+        rows = [{f"of_{name}": row[name] for name in (*_KEY, *_VALUES)} for row in changed]
+        connection.execute(_update(*_VALUES), rows)
+    if moved:
+        connection.execute(_update("position"), moved)
+    return number
 
 
-def run_blocks(study: Study, prepare: Prepare, record: Run, on_event: OnEvent) -> Outcome:
-    """Queue the blocks (groups of episodes) of a plan. Run them in this process, in worker processes or on a cluster.
+_KEY = ("setting_id", "task", "seed")
+_VALUES = ("position", "episode_id", "error", "block", "worker", "attempts", "anew")
+_OF_KEY = [WANTED.c[name] == sa.bindparam(f"of_{name}") for name in _KEY]
 
-    When this function returns or raises, no process of this machine runs the plan's blocks any more. No block stays
-    queued, unless the workers of a cluster go on without this command. They also go on if this process is killed.
 
-    Args:
-        study: The study with its plan.
-        prepare: Builds a setting's decoder for a task. Used in this process only.
-        record: The database row of this command.
-        on_event: Called with each event, to show progress.
+def _update(*names: str) -> sa.Update:
+    return sa.update(WANTED).where(*_OF_KEY).values({name: sa.bindparam(f"of_{name}") for name in names})
 
-    Raises:
-        Detached: `runtime.detach` is set, and workers of a cluster run the blocks. The message names them.
+
+def _stays(row: Any, linked: int | None, plan: Plan, is_shared: bool) -> bool:
+    """Return whether a row of the study stays as it is: it has an episode that counts, or a worker may run it."""
+    if row.episode_id is not None:
+        return linked is not None or row.episode_id not in plan.seen
+    return is_shared and row.is_unfinished
+
+
+def _positions(wanted: Iterable[tuple[int, str, int]], before: Mapping[tuple[int, str, int], Any]) -> dict[Any, int]:
+    """Return the position of each row in the study. The old ones are kept if that is the order of the plan."""
+    wanted = list(wanted)
+    old = [before[key].position if key in before else None for key in wanted]
+    there = [position for position in old if position is not None]
+    last = max((row.position for row in before.values()), default=0)
+    if there == sorted(there) and None not in old[: len(there)]:
+        return dict(zip(wanted, [*there, *range(last + 1, last + 1 + len(old) - len(there))], strict=True))
+    return {key: last + number for number, key in enumerate(wanted, 1)}
+
+
+def _somebody_runs(connection: sa.Connection, study: Study, run: str) -> bool:
+    """Return whether another command makes the study, or a worker runs one of its episodes."""
+    if any(row.id != run for row in running(study.database, connection, study.kind, study.name)):
+        return True
+    mine = WANTED.join(STUDIES, WANTED.c.study_id == STUDIES.c.id)
+    claimed = sa.select(WANTED.c.worker).distinct().select_from(mine).where(STUDIES.c.name == study.name, UNFINISHED)
+    return bool(living(study.database, connection).keys() & set(connection.scalars(claimed)))
+
+
+def _vanished(connection: sa.Connection, numbers: Iterable[int]) -> set[int]:
+    """Return those row numbers of episodes that were removed since the study was planned."""
+    wanted = sorted(set(numbers))
+    there: set[int] = set()
+    for first in range(0, len(wanted), _AT_ONCE):
+        part = wanted[first : first + _AT_ONCE]
+        there.update(connection.scalars(sa.select(EPISODES.c.id).where(EPISODES.c.id.in_(part))))
+    return set(wanted) - there
+
+
+def _check_orders(study: Study, to_run: Mapping[Episode, object], is_shared: bool) -> None:
+    """Refuse to add episodes to a group that must run in order, while somebody runs the study."""
+    for part in ordered_parts(study.episodes, study.block) if is_shared else ():
+        if 0 < sum(one in to_run for one in part) < len(part):
+            raise UsageError(
+                f"study {study.name} is running, and {part[0].setting.label} adapts from episode to episode: "
+                "wait until it has ended"
+            )
+
+
+def _take_away(connection: sa.Connection, study: Study, ids: Mapping[str, int], rows: Iterable[Any]) -> None:
+    """Remove rows outside a plan, or let them lose their block. `save` says which."""
+    seeds = defaultdict[int, list[int]](list)
+    for one in study.episodes:
+        seeds[ids[one.setting.label]].append(one.seed)
+    spans = {number: (min(some), max(some)) for number, some in seeds.items()}
+    tasks, gone, idle = set(study.tasks), [], []
+    for row in rows:
+        low, high = spans.get(row.setting_id, (0, -1))
+        key = {f"of_{name}": getattr(row, name) for name in _KEY}
+        if row.task in tasks or not low <= row.seed <= high:
+            gone.append(key)
+        elif row.is_unfinished:
+            idle.append(key)
+    if gone:
+        connection.execute(sa.delete(WANTED).where(*_OF_KEY), gone)
+    if idle:
+        connection.execute(sa.update(WANTED).where(*_OF_KEY).values(block=None, worker=None, attempts=0), idle)
+
+
+def withdraw(plan: Plan, run: str) -> None:
+    """Let rows that nobody runs lose their block, so that workers anywhere end when theirs does.
+
+    If another command makes the study, nothing is taken away.
     """
-    runtime, blocks = study.runtime, study.blocks
-    queue = Queue(study, record.id)
-    queue.fill()
-    progress = Progress(study, record, on_event)
-    threads = max((one.setting.settings["runtime"]["threads"] for one in study.to_run), default=1)
-    try:
-        if blocks and runtime.executor == SLURM:
-            array = Array(queue, runtime, threads)
-            if runtime.detach:
-                raise Detached(f"job {array.id} of Slurm runs them, its logs are in {array.logs}")
-            with array:
-                progress.follow(queue, lambda: array.tend(progress.ended))
-        elif blocks and runtime.workers > 1:
-            number = min(runtime.workers, len(blocks))
-            with LocalWorkers(queue, number, threads, gpus_in_turn(study.device)) as workers:
-                progress.follow(queue, workers.tend)
-        elif blocks:
-            work(queue, prepare, progress.see)
-        return progress.end()
-    except Detached:
-        raise
-    except BaseException:
-        with contextlib.suppress(StorageError):
-            queue.withdraw()
-        raise
-
-
-def _kept(study: Study) -> str:
-    """Return how many episodes of a study are stored, as text. The text has no numbers if the database fails."""
-    try:
-        done, total = study.counts()
-        return f"{done} of {count(total or len(study.episodes), 'episode')}"  # its plan may not be written yet
-    except StorageError:
-        return "all complete episodes"
-
-
-class Progress:
-    """Collects the outcome of a plan, from the events of a worker in this process and from the database.
-
-    Args:
-        study: The study with its plan.
-        record: The database row of the command.
-        on_event: Called with each event, to show progress.
-    """
-
-    def __init__(self, study: Study, record: Run, on_event: OnEvent) -> None:
-        self.study, self.record, self.on_event = study, record, on_event
-        self.outcome = Outcome(reused=list(study.existing))
-        self._missing = {one.key: one for one in study.to_run}
-        self._newest, self._began = study.newest, time.perf_counter()
-        is_timed = any(block.batch == 1 for block in study.blocks)
-        on_event(Started(len(self._missing), len(study.existing), load_per_core() if is_timed else 0.0))
-
-    def see(self, event: Event) -> None:
-        """Update the outcome with an event, and pass the event on to `on_event`."""
-        if isinstance(event, EpisodeEnd):
-            one = self._missing.pop(event.episode.key, None)
-            if one is None:
-                return
-            event = replace(event, episode=one)
-            (self.outcome.reused if event.elsewhere else self.outcome.done).append(one)
-            self.record.beat(len(self.outcome.done))
-        elif isinstance(event, SettingFailed):
-            event = replace(event, episodes=tuple(self._missing.pop(one.key, one) for one in event.episodes))
-            self.outcome.failed.append(event)
-        elif isinstance(event, BlockStarted):
-            self.look()
-        self.on_event(event)
-
-    @property
-    def ended(self) -> int:
-        """Number of episodes and settings that have ended or failed so far."""
-        return len(self.outcome.done) + len(self.outcome.failed)
-
-    def look(self) -> None:
-        """Read from the database which episodes other processes have run, and which have failed."""
-        for ended in self._ended():
-            self.see(ended)
-        for failure in self._failed():
-            self.see(failure)
-
-    def _ended(self) -> list[EpisodeEnd]:
-        ended = []
-        for key, rows in self.study.stored(self._newest).items():
-            self._newest, row = max(self._newest, rows[-1].id), rows[0]
-            if one := self._missing.get(key):
-                ended.append(EpisodeEnd(one, row.success, row.seconds or 0.0, row.run != self.record.id))
-        return ended
-
-    def _failed(self) -> list[SettingFailed]:
-        columns = (SETTINGS.c.work, WANTED.c.task, WANTED.c.seed, WANTED.c.error)
-        query = sa.select(*columns).select_from(PLANNED).order_by(WANTED.c.position)
-        query = query.where(STUDIES.c.name == self.study.name, WANTED.c.error.is_not(None))
-        failed: dict[tuple[str, str, str], dict[Episode, None]] = {}
-        with self.study.database.reading() as connection:
-            for *key, error in connection.execute(query):
-                if one := self._missing.get(tuple(key)):
-                    failed.setdefault((key[0], key[1], error), {})[one] = None
-        found = []
-        for (_, _, error), episodes in failed.items():
-            reason, _, trace = error.partition("\n")
-            found.append(SettingFailed(reason, trace, episodes=tuple(episodes)))
-        return found
-
-    def follow(self, queue: Queue, tend: Callable[[], None]) -> None:
-        """Wait until every block (group of episodes) of a queue has ended. Show the progress of the workers.
-
-        Args:
-            queue: The blocks.
-            tend: Replaces workers that have ended. It is called each time before the database is read.
-        """
-        shown: set[tuple[int, str]] = set()
-        while patiently(queue.left)[0]:
-            tend()
-            for position, worker in patiently(queue.claimed):
-                if (position, worker) not in shown:
-                    shown.add((position, worker))
-                    self.on_event(BlockStarted(self.study.blocks[position]))
-            patiently(self.look)
-            time.sleep(FOLLOW_SECONDS)
-
-    def end(self) -> Outcome:
-        """Return the outcome, after all blocks have ended.
-
-        Raises:
-            KervError: The study was deleted.
-        """
-        self.look()
-        if self._missing:
-            if not self.study.exists:
-                name = self.study.name
-                raise KervError(f"study {name} was deleted while it ran: run the same command to start it again")
-            reason = "another command has planned the study anew, without it: run the same command again"
-            self.see(SettingFailed(reason, episodes=tuple(self._missing.values())))
-        self.outcome.seconds = time.perf_counter() - self._began
-        return self.outcome
-
-
-class TimeLeft:
-    """Estimates how long the missing episodes of a plan take, and corrects the estimate when an episode ends.
-
-    An episode is expected to take the mean time of its setting's finished episodes. A setting without finished episodes
-    gets the average of the other settings' means. The workers share the total equally.
-
-    Args:
-        study: The study with its plan.
-        guess: Seconds per episode while no episode is measured.
-    """
-
-    def __init__(self, study: Study, guess: float) -> None:
-        self.workers = max(1, min(study.runtime.workers, len(study.blocks)))
-        self._waiting = Counter(one.setting.work for one in study.to_run)
-        self._guess, works = guess, {setting.work for setting in study.settings}
-        query = sa.select(EPISODES.c.work, sa.func.avg(EPISODES.c.wall_seconds), sa.func.count(EPISODES.c.wall_seconds))
-        with study.database.reading() as connection:
-            rows = connection.execute(query.where(EPISODES.c.work.in_(works)).group_by(EPISODES.c.work)).all()
-        self._stored: dict[str, float] = {}
-        stored = 0
-        for key, mean, number in rows:
-            stored += number
-            if mean is not None:
-                self._stored[key] = float(mean)
-        self._ended: Counter[str] = Counter()
-        self._measured: defaultdict[str, float] = defaultdict(float)  # seconds of those that ended, by setting
-        self.source = (
-            f"measured on {count(stored, 'stored episode')}" if stored else f"a guess of {guess:g} s per episode"
-        )
-
-    def see(self, event: Event) -> None:
-        """Update the estimate with an event of the run: an episode that ended, or episodes that will not run."""
-        if isinstance(event, EpisodeEnd):
-            self._waiting[event.episode.setting.work] -= 1
-            if event.seconds:
-                self._ended[event.episode.setting.work] += 1
-                self._measured[event.episode.setting.work] += event.seconds
-        elif isinstance(event, SettingFailed):
-            self._waiting.subtract(one.setting.work for one in event.episodes)
-
-    @property
-    def seconds(self) -> float:
-        """Estimated seconds until every planned episode has ended or failed."""
-        means = dict(self._stored)
-        for key, number in self._ended.items():
-            means[key] = self._measured[key] / number
-        mean = sum(means.values()) / len(means) if means else self._guess
-        seconds = 0.0
-        for key, number in self._waiting.items():
-            seconds += number * means.get(key, mean)
-        return seconds / self.workers
+    study = plan.study
+    with study.database.writing() as connection:
+        if any(row.id != run for row in running(study.database, connection, study.kind, study.name)):
+            return
+        mine = sa.select(STUDIES.c.id).where(STUDIES.c.name == study.name).scalar_subquery()
+        alive = [name for name, whose in living(study.database, connection).items() if whose != run]
+        free = sa.or_(WANTED.c.worker.is_(None), WANTED.c.worker.not_in(alive))
+        idle = sa.update(WANTED).where(WANTED.c.study_id == mine, UNFINISHED, free)
+        connection.execute(idle.values(block=None, worker=None, attempts=0))

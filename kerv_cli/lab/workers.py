@@ -1,34 +1,31 @@
-"""Workers of a sweep, which are processes of `kerv work`: on this machine, or on a Slurm cluster.
+"""Workers of a sweep, which are processes of `kerv work`: on this machine, or wherever a command starts them.
 
-Workers on this machine end when the sweep ends, even if the sweep is killed. Workers on a cluster are one array of
-jobs, which can outlive the sweep. A later sweep of the same study finds the array by its name. The nodes must share
-the results folder, or the database must be on a server.
+Workers on this machine end when the sweep ends, even if the sweep is killed. Others end when no block is left.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import itertools
 import os
 import shlex
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import IO, Any
+
+import sqlalchemy as sa
 
 from kerv_cli.base.config import as_overrides
 from kerv_cli.base.durations import count
-from kerv_cli.base.errors import KervError, StorageError, UsageError
-from kerv_cli.base.files import storage_errors, visible
-from kerv_cli.base.settings import RuntimeSettings
+from kerv_cli.base.errors import KervError
 from kerv_cli.lab.command import STORE
-from kerv_cli.lab.store import Study
-from kerv_cli.lab.work import Queue, patiently
+from kerv_cli.lab.database import PLANNED, STUDIES, UNFINISHED, WANTED, Database
+from kerv_cli.lab.presence import bury
+from kerv_cli.lab.queue import patiently
+from kerv_cli.lab.study import Plan
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 """Environment variables with the number of CPU threads of numerical libraries.
@@ -39,27 +36,14 @@ GPUS = "CUDA_VISIBLE_DEVICES"
 
 MOST_STILLBORN = 3
 """After this many workers in a row have died before they claimed a block, the sweep ends."""
-_LOOK_SECONDS = 5.0
-"""Seconds between two questions to Slurm."""
 
 
-def worker_command(queue: Queue, threads: int, **settings: str) -> tuple[list[str], dict[str, str]]:
-    """Return the command line and the environment variables that start a worker for a queue's study.
-
-    Args:
-        queue: The queue, which names the study and the database.
-        threads: Number of CPU threads.
-        **settings: Further settings of `kerv work`.
-    """
-    results = str(queue.database.results.absolute())
-    words = as_overrides(study=queue.study.name, results=results, **settings)
-    environment = os.environ | dict.fromkeys(THREAD_VARIABLES, str(threads)) | {STORE: queue.database.store}
-    return [sys.executable, "-m", "kerv_cli", "work", *words], environment
-
-
-def last_line(text: str) -> str:
-    """Return the last line of `text` that is not blank. Empty if every line is blank."""
-    return text.strip().rpartition("\n")[2].strip()
+def work_command(database: Database, study: str, **settings: str) -> str:
+    """Return the shell command that starts a worker for a study. It names no password."""
+    words = as_overrides(study=study, results=str(database.results.absolute()), **settings)
+    if database.store and not sa.make_url(database.store).password:
+        words.append(f"store={database.shown}")
+    return shlex.join(["kerv", "work", *words])
 
 
 def gpus_in_turn(device: str) -> list[str]:
@@ -80,19 +64,64 @@ def gpus_in_turn(device: str) -> list[str]:
     return list(map(str, range(torch.cuda.device_count())))
 
 
-def disturbances(study: Study) -> list[str]:
+def disturbances(plan: Plan) -> list[str]:
     """Return sentences about what will disturb the measured times: workers that share a GPU or the CPU's memory."""
-    runtime = study.runtime
-    if runtime.workers == 1 or runtime.executor != "local" or all(block.batch > 1 for block in study.blocks):
+    number = plan.runtime.workers
+    if number < 2 or plan.is_elsewhere or all(block.batch > 1 for block in plan.blocks):
         return []
-    gpus = len(gpus_in_turn(study.device))
-    if study.device != "cuda":
+    gpus = len(gpus_in_turn(plan.device))
+    if plan.device != "cuda":
         shared = "share this machine's memory: each needs a core and a memory channel of its own"
-    elif runtime.workers > gpus:
+    elif number > gpus:
         shared = f"share {count(gpus, 'GPU')}"
     else:
         return []
-    return [f"{runtime.workers} workers measure times and {shared} (docs/scale.md)"]
+    return [f"{number} workers measure times and {shared} (docs/scale.md)"]
+
+
+@contextlib.contextmanager
+def workers(plan: Plan, run: str, say: Callable[[str], object] = lambda line: None) -> Iterator[Callable[[], object]]:
+    """Start the workers of a plan for a `with` block.
+
+    Args:
+        plan: The plan, which is saved.
+        run: Id of this command.
+        say: Prints a line.
+
+    Yields:
+        A function to call again and again. It frees what killed workers had claimed, and replaces them.
+
+    Raises:
+        KervError: The command of `runtime.launch` fails.
+    """
+    runtime, study = plan.runtime, plan.study
+    environment = os.environ | {STORE: study.database.store}
+    if plan.blocks and plan.is_elsewhere:
+        line = work_command(study.database, study.name)
+        if runtime.launch:
+            _launch(runtime.launch.replace("{command}", line).replace("{workers}", str(runtime.workers)), environment)
+        else:
+            say(f"start workers, as many as you like: {line}")
+    if not plan.blocks or plan.is_elsewhere or runtime.workers == 1:
+        yield lambda: patiently(bury, study.database)
+        return
+    threads = max((one.setting.settings["runtime"]["threads"] for one in plan.to_run), default=1)
+    environment |= dict.fromkeys(THREAD_VARIABLES, str(threads))
+    number = min(runtime.workers, len(plan.blocks))
+    with LocalWorkers(study.database, study.name, run, number, environment, gpus_in_turn(plan.device)) as local:
+        yield local.tend
+
+
+def _launch(line: str, environment: dict[str, str]) -> None:
+    done = subprocess.run(line, shell=True, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        said = last_line(done.stderr) or last_line(done.stdout) or f"exit code {done.returncode}"
+        raise KervError(f"runtime.launch: {line} failed: {said}")
+
+
+def last_line(text: str) -> str:
+    """Return the last line of `text` that is not blank. Empty if every line is blank."""
+    return text.strip().rpartition("\n")[2].strip()
 
 
 @dataclass
@@ -102,7 +131,6 @@ class _Worker:
     gpu: str
 
     def last_line(self) -> str:
-        """Return the last line that the worker has printed."""
         self.log.seek(0)
         return last_line(self.log.read().decode(errors="replace"))
 
@@ -114,18 +142,32 @@ class LocalWorkers:
     closed, and the workers end.
 
     Args:
-        queue: The blocks that the workers run.
+        database: The database.
+        study: Name of the study.
+        run: Id of the command.
         number: Number of workers.
-        threads: Number of CPU threads per worker.
+        environment: Environment variables.
         gpus: Values of CUDA_VISIBLE_DEVICES, which the workers get in turn. If empty, the variable stays as it is.
     """
 
-    def __init__(self, queue: Queue, number: int, threads: int, gpus: Sequence[str] = ()) -> None:
-        self.queue, self.threads, self._stillborn = queue, threads, 0
+    def __init__(
+        self,
+        database: Database,
+        study: str,
+        run: str,
+        number: int,
+        environment: dict[str, str],
+        gpus: Sequence[str] = (),
+    ) -> None:
+        self.database, self.study, self._environment = database, study, environment
+        self._stillborn, self._progress = 0, (0, 0)
+        words = as_overrides(study=study, results=str(database.results.absolute()), run=run)
+        self._words = [sys.executable, "-m", "kerv_cli", "work", *words]
         self._gpus = list(itertools.islice(itertools.cycle(gpus or [""]), number))
         self._workers: list[_Worker] = []
 
     def __enter__(self) -> LocalWorkers:
+        self._progress = self._read_progress()
         self._workers = list(map(self._started, self._gpus))
         return self
 
@@ -135,15 +177,22 @@ class LocalWorkers:
         for worker in self._workers:
             worker.process.wait()
             self._close(worker)
-            with contextlib.suppress(StorageError):
-                self.queue.lapse(worker.process.pid)
+        with contextlib.suppress(KervError):
+            bury(self.database)
+
+    def _read_progress(self) -> tuple[int, int]:
+        """Return the number of unfinished episodes, and how often one was begun: a death in an episode changes it."""
+        begun = sa.func.coalesce(sa.func.sum(WANTED.c.attempts), 0)
+        query = sa.select(sa.func.count(), begun).select_from(PLANNED)
+        with self.database.reading() as connection:
+            left, number = connection.execute(query.where(STUDIES.c.name == self.study, UNFINISHED)).one()
+        return int(left), int(number)
 
     def _started(self, gpu: str) -> _Worker:
-        words, environment = worker_command(self.queue, self.threads, run=self.queue.run)
-        environment |= {GPUS: gpu} if gpu else {}
+        environment = self._environment | ({GPUS: gpu} if gpu else {})
         log = tempfile.TemporaryFile()  # noqa: SIM115 - `_close` closes it
         streams: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": log}
-        return _Worker(subprocess.Popen(words, env=environment, **streams), log, gpu)
+        return _Worker(subprocess.Popen(self._words, env=environment, **streams), log, gpu)
 
     @staticmethod
     def _close(worker: _Worker) -> None:
@@ -152,12 +201,13 @@ class LocalWorkers:
         worker.log.close()
 
     def tend(self) -> None:
-        """Replace workers that were killed.
+        """Free what killed workers had claimed, and replace them.
 
         Raises:
             KervError: A worker has ended with an error, or MOST_STILLBORN in a row were killed before they claimed a
                 block.
         """
+        patiently(bury, self.database)
         for at, worker in enumerate(self._workers):
             code = worker.process.poll()
             if code is None or code == 0:
@@ -165,112 +215,10 @@ class LocalWorkers:
             if code not in (130, 137) and code > 0:
                 line = worker.last_line().removeprefix("kerv: ")
                 raise KervError(f"a worker process ended: {line or f'exit code {code}'}")
-            had_claims = patiently(self.queue.lapse, worker.process.pid)
-            self._stillborn = 0 if had_claims else self._stillborn + 1
+            before, self._progress = self._progress, patiently(self._read_progress)
+            self._stillborn = self._stillborn + 1 if before == self._progress else 0
             if self._stillborn >= MOST_STILLBORN:
                 raise KervError(f"{self._stillborn} worker processes were killed before they ran a block: "
                                 "is there enough memory for them? try runtime.workers=1")  # fmt: skip
             self._close(worker)
             self._workers[at] = self._started(worker.gpu)
-
-
-def _ask(program: str, *words: str, text: str = "", environment: dict[str, str] | None = None) -> str:
-    """Run a program of Slurm, and return what it prints.
-
-    Raises:
-        UsageError: There is no such program, it does not answer within 60 s, or it refuses.
-    """
-    try:
-        run = subprocess.run(
-            [program, *words], input=text, capture_output=True, text=True, timeout=60, env=environment, check=False
-        )
-    except FileNotFoundError:
-        raise UsageError(f"Slurm cannot be used from here: there is no program {program}") from None
-    except subprocess.TimeoutExpired:
-        raise UsageError(f"Slurm cannot be used from here: {program} does not answer") from None
-    if run.returncode:
-        refusal = " ".join((run.stderr or run.stdout).split())
-        raise UsageError(f"Slurm refuses: {refusal}: change runtime.executor_options")
-    return run.stdout
-
-
-class Array:
-    """The workers of a study on a cluster: an array of Slurm jobs. Ctrl-C in the `with` statement cancels the jobs.
-
-    An array from an earlier sweep of the study is used if it still waits or runs. Otherwise a new one is submitted.
-
-    Args:
-        queue: The blocks.
-        runtime: Number of workers, and the resources that each worker needs.
-        threads: Number of CPU threads per worker.
-
-    Raises:
-        UsageError: This machine has no Slurm, or Slurm refuses the job.
-        StorageError: The folder of the workers' logs cannot be made.
-    """
-
-    def __init__(self, queue: Queue, runtime: RuntimeSettings, threads: int) -> None:
-        self.queue, self.runtime, self.threads = queue, runtime, threads
-        self.logs = queue.study.root / "jobs"
-        database = hashlib.sha256(queue.database.shown.encode()).hexdigest()[:8]
-        self.name = f"kerv-{queue.study.name}-{database}"
-        self.id = self._running() or self._submitted()
-        self._asked, self._ended = time.monotonic(), -1
-
-    def __enter__(self) -> Array:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
-        if kind is KeyboardInterrupt:
-            with contextlib.suppress(KervError):
-                _ask("scancel", self.id)
-
-    def _running(self) -> str:
-        """Return the id of this study's array if it waits or runs. Empty if there is no such array."""
-        found = _ask("squeue", "--noheader", "--me", f"--name={self.name}", "--format=%F").split()
-        return found[0] if found else ""
-
-    def _submitted(self) -> str:
-        """Submit an array, and return its id."""
-        runtime, options = self.runtime, self.runtime.executor_options
-        words, environment = worker_command(self.queue, self.threads)
-        with storage_errors(self.logs):
-            self.logs.mkdir(parents=True, exist_ok=True)
-        asked = {
-            "job-name": self.name,
-            "array": f"0-{runtime.workers - 1}",
-            "output": f"{self.logs.absolute()}/%A_%a.log",
-            "open-mode": "append",
-            "time": options.minutes,
-            "cpus-per-task": self.threads,
-            "mem": f"{options.memory_gb}G",
-            **({"gpus": options.gpus} if options.gpus else {}),
-            **({"partition": options.partition} if options.partition else {}),
-        }
-        script = "\n".join(["#!/bin/sh", *options.setup, f"exec {shlex.join(words)}", ""])
-        flags = list(map("--{}={}".format, asked, asked.values()))
-        printed = _ask("sbatch", "--parsable", "--requeue", *flags, text=script, environment=environment)
-        return printed.strip().partition(";")[0]
-
-    def tend(self, ended: int) -> None:
-        """Submit another array if all jobs have ended but some episodes are left, for example at a time limit.
-
-        Args:
-            ended: Number of episodes and settings that have ended or failed so far.
-
-        Raises:
-            KervError: All jobs of an array from this method have ended, and no episode or setting ended meanwhile.
-        """
-        if time.monotonic() - self._asked < _LOOK_SECONDS:
-            return
-        self._asked = time.monotonic()
-        if self._running() or not self.queue.left()[0]:
-            return
-        if ended <= self._ended:
-            raise KervError(f"job {self.id} of Slurm has ended without an episode: {self._last_line()}")
-        self.id, self._ended = self._submitted(), ended
-
-    def _last_line(self) -> str:
-        """Return the last line of the newest log. If there is none, return a text that says where the logs are."""
-        logs: list[Path] = sorted(visible(self.logs), key=lambda path: path.stat().st_mtime)
-        return (logs and last_line(logs[-1].read_text(errors="replace"))) or f"see {self.logs}"

@@ -39,7 +39,7 @@ from kerv_cli.worlds import specs
 
 RUNTIME = ("device", "dtype", "threads")
 _PROVENANCE = (
-    "executor", "workers", "device_name", "host", *map("{}_version".format, PACKAGES), "python_version",
+    "workers", "device_name", "host", *map("{}_version".format, PACKAGES), "python_version",
     "git_commit", "engine", "run", "load",
 )  # fmt: skip
 

@@ -1,0 +1,234 @@
+"""The rows of a study as one worker sees them: claim a block, note what begins, write what ended, give up what failed.
+
+Every method is one transaction, and a database has one writer at a time. A claim lasts as long as the worker's
+heartbeat, and every write checks that the rows still belong to the worker.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import sqlalchemy as sa
+
+from kerv_cli.base.errors import KervError, StorageError
+from kerv_cli.episodes.identity import Setting
+from kerv_cli.lab.database import PLANNED, RUNS, SETTINGS, STUDIES, UNFINISHED, WANTED, WORKERS, Unanswered
+from kerv_cli.lab.plan import Block, Episode
+from kerv_cli.lab.presence import beats
+from kerv_cli.lab.store import ROLLOUT, Study, setting_of, stored_episodes, write_episode
+
+T = TypeVar("T")
+
+MOST_DEATHS = 3
+"""After so many workers have died in an episode, its setting fails in the block."""
+PATIENCE_SECONDS = 120.0
+"""Seconds for which a worker tries to reach a database that does not answer."""
+
+
+class ClaimLost(KervError):
+    """An episode does not belong to this worker any more: its heartbeat was late, or the study was deleted."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """Episodes that this worker runs.
+
+    Attributes:
+        run: Id of the command with which they are stored.
+        block: The episodes.
+        deadly: An episode in which MOST_DEATHS workers have died. None if there is none.
+    """
+
+    run: str
+    block: Block
+    deadly: Episode | None = None
+
+
+class Queue:
+    """The unfinished rows of a study, for one worker.
+
+    Args:
+        study: The study. Only its database, name and kind matter.
+        worker: Name of the worker in the table WORKERS.
+        run: Id of the command for which it works. If empty, the study's newest command.
+    """
+
+    def __init__(self, study: Study, worker: str, run: str = "") -> None:
+        self.study, self.worker, self.run, self.database = study, worker, run, study.database
+        with self.database.reading() as connection:
+            number = connection.scalar(sa.select(STUDIES.c.id).where(STUDIES.c.name == study.name))
+        self._of_study = sa.and_(WANTED.c.study_id == (number or 0), UNFINISHED)
+        self.number = number or 0
+        self._settings: dict[int, Setting] = {}
+
+    def claim(self) -> Claim | None:
+        """Claim the free rows of the first block that has some. Return None if there is none now.
+
+        Rows whose episode another study has stored meanwhile are linked to it. The block of the claim may be empty.
+        """
+        with self.database.writing() as connection:
+            others = self._others(connection)
+            is_open = sa.and_(self._of_study, self._is_free(others))
+            first = sa.select(WANTED.c.block).where(is_open, WANTED.c.block.not_in(self._busy(connection, others)))
+            number = first.order_by(WANTED.c.block).limit(1).correlate(None).scalar_subquery()
+            taken = sa.update(WANTED).where(is_open, WANTED.c.block == number)
+            rows = connection.execute(taken.values(worker=self.worker).returning(WANTED)).all()
+            if not rows:
+                return None
+            settings = self._settings_of(connection, rows)
+            rows = self._whole_orders(connection, rows, settings)
+            linked = self._link(connection, rows, settings)
+            run = self.run or connection.scalar(self._newest_run()) or ""
+        episodes, deadly = dict[Any, Episode](), None
+        for row in sorted(rows, key=lambda row: row.position):
+            one = Episode(settings[row.setting_id], row.task, row.seed)
+            if one.key not in linked:
+                one = episodes.setdefault(one.key, one)
+                deadly = one if row.attempts >= MOST_DEATHS else deadly
+        return Claim(run, Block(tuple(episodes.values())), deadly)
+
+    def _others(self, connection: sa.Connection) -> Sequence[str]:
+        """Return the names of the other workers that live."""
+        return connection.scalars(
+            sa.select(WORKERS.c.name).where(beats(connection), WORKERS.c.name != self.worker)
+        ).all()
+
+    def _is_free(self, others: Sequence[str]) -> sa.ColumnElement[bool]:
+        # a row of this worker is one whose claim was committed, but the answer was lost
+        return sa.or_(WANTED.c.worker.is_(None), WANTED.c.worker.not_in(others))
+
+    def _busy(self, connection: sa.Connection, others: Sequence[str]) -> set[int]:
+        """Return the blocks with an episode that a worker runs now for another study: it will be linked."""
+        if self.study.kind == ROLLOUT:  # rollouts share no episodes with other studies
+            return set()
+        query = sa.select(SETTINGS.c.work, WANTED.c.task, WANTED.c.seed).select_from(PLANNED)
+        query = query.where(WANTED.c.worker.in_(others), UNFINISHED, STUDIES.c.kind != ROLLOUT)
+        held = {tuple(row) for row in connection.execute(query.where(STUDIES.c.id != self.number))}
+        if not held:
+            return set()
+        works, tasks, seeds = map(set, zip(*held, strict=True))
+        mine = sa.select(WANTED.c.block, SETTINGS.c.work, WANTED.c.task, WANTED.c.seed).select_from(PLANNED)
+        mine = mine.where(SETTINGS.c.work.in_(works), WANTED.c.task.in_(tasks), WANTED.c.seed.in_(seeds))
+        return {row[0] for row in connection.execute(mine.where(self._of_study)) if tuple(row[1:]) in held}
+
+    def _newest_run(self) -> sa.Select[Any]:
+        same = RUNS.c.kind == self.study.kind, RUNS.c.name == self.study.name
+        return sa.select(RUNS.c.id).where(*same).order_by(RUNS.c.started.desc(), RUNS.c.id.desc()).limit(1)
+
+    def _settings_of(self, connection: sa.Connection, rows: Sequence[Any]) -> Mapping[int, Setting]:
+        """Return the study's settings by id. Their `results` is this process's results folder.
+
+        Raises:
+            KervError: This version of kerv computes other results than the version that planned the block.
+        """
+        if not self._settings.keys() >= {row.setting_id for row in rows}:
+            for one in connection.execute(sa.select(SETTINGS).where(SETTINGS.c.study_id == self.number)):
+                setting = setting_of(one)
+                if setting.work != one.work:
+                    raise KervError(f"{setting.label} was planned by another version of kerv: type the sweep again")
+                plain = {**setting.settings, "results": str(self.database.results)}
+                self._settings[one.id] = replace(setting, settings=plain)
+        return self._settings
+
+    def _whole_orders(
+        self, connection: sa.Connection, rows: Sequence[Any], settings: Mapping[int, Setting]
+    ) -> Sequence[Any]:
+        """Claim also the finished rows of a setting whose results depend on the order, if its block was begun."""
+        ordered = [number for number in {row.setting_id for row in rows} if settings[number].depends_on_order]
+        if not ordered:
+            return rows
+        begun = WANTED.c.study_id == self.number, WANTED.c.block == rows[0].block, WANTED.c.setting_id.in_(ordered)
+        again = sa.update(WANTED).where(*begun, WANTED.c.episode_id.is_not(None), WANTED.c.error.is_(None))
+        values = {"worker": self.worker, "episode_id": None, "attempts": 0}
+        return [*rows, *connection.execute(again.values(**values).returning(WANTED)).all()]
+
+    def _link(self, connection: sa.Connection, rows: Sequence[Any], settings: Mapping[int, Setting]) -> set[Any]:
+        """Link rows to episodes that other studies have stored. Return the keys of these episodes."""
+        ready = [row for row in rows if not row.anew and not settings[row.setting_id].depends_on_order]
+        if not ready:
+            return set()
+        works = {settings[row.setting_id].work for row in ready}
+        tasks, seeds = {row.task for row in ready}, {row.seed for row in ready}
+        stored, linked = stored_episodes(connection, self.study.kind, works, tasks, seeds), set()
+        for row in ready:
+            key = settings[row.setting_id].work, row.task, row.seed
+            if found := stored.get(key):
+                own = {name: getattr(row, name) for name in ("setting_id", "task", "seed")}
+                connection.execute(sa.update(WANTED).filter_by(**own).values(episode_id=found[-1].id))
+                linked.add(key)
+        return linked
+
+    def _rows(self, one: Episode) -> sa.ColumnElement[bool]:
+        """Return the condition of the rows of an episode: several, if settings with other labels share it."""
+        ids = [number for number, setting in self._settings.items() if setting.work == one.setting.work]
+        of_study = WANTED.c.study_id == self.number
+        return sa.and_(of_study, WANTED.c.setting_id.in_(ids), WANTED.c.task == one.task, WANTED.c.seed == one.seed)
+
+    def _change(self, connection: sa.Connection, one: Episode, is_mine: Any = UNFINISHED, **values: Any) -> None:
+        mine = self._rows(one), WANTED.c.worker == self.worker, is_mine
+        if not connection.execute(sa.update(WANTED).where(*mine).values(**values)).rowcount:
+            raise ClaimLost("the worker was silent for too long, or the study was deleted")
+
+    def begin(self, one: Episode, before: Episode | None = None) -> None:
+        """Note that an episode, or the preparation of its setting, begins. `before` is what was noted last."""
+        with self.database.writing() as connection:
+            if before is not None:
+                self._change(connection, before, attempts=WANTED.c.attempts - 1)
+            self._change(connection, one, attempts=WANTED.c.attempts + 1)
+
+    def write(
+        self, one: Episode, block: Mapping[str, Any], row: Mapping[str, Any], decodes: bytes, then: Episode | None
+    ) -> None:
+        """Write an episode that has ended, and note that another begins.
+
+        Args:
+            one: The episode.
+            block: Row of its block.
+            row: Columns of the table `episodes`.
+            decodes: The episode's decodes, as the bytes of a Parquet file.
+            then: The episode that begins now. None if there is none.
+
+        Raises:
+            ClaimLost: The episode does not belong to this worker any more. Nothing is written.
+        """
+        with self.database.writing() as connection:
+            # it is there already if it was committed, but the answer was lost
+            number = write_episode(connection, one.key, block, row, decodes)
+            is_mine = sa.or_(WANTED.c.episode_id.is_(None), WANTED.c.episode_id == number)
+            self._change(connection, one, is_mine, episode_id=number, error=None, attempts=0, anew=False)
+            if then is not None:
+                self._change(connection, then, attempts=WANTED.c.attempts + 1)
+
+    def fail(self, episodes: Sequence[Episode], error: str) -> None:
+        """Write why episodes of this worker failed or will not run."""
+        with self.database.writing() as connection:
+            for one in episodes:
+                self._change(connection, one, sa.true(), error=error, attempts=0)
+
+    def left(self) -> tuple[int, int]:
+        """Return the number of unfinished rows of the study, and how many of these are free for this worker."""
+        with self.database.reading() as connection:
+            free = sa.case((self._is_free(self._others(connection)), 1), else_=0)
+            query = sa.select(sa.func.count(), sa.func.coalesce(sa.func.sum(free), 0)).where(self._of_study)
+            waiting, number = connection.execute(query).one()
+        return int(waiting), int(number)
+
+
+def patiently(action: Callable[..., T], *arguments: Any) -> T:
+    """Call a function that uses the database. While the database does not answer, call it again.
+
+    Raises:
+        StorageError: The database did not answer for PATIENCE_SECONDS. Or calling again would not help, for example
+            because the disk is full.
+    """
+    deadline = time.monotonic() + PATIENCE_SECONDS
+    while True:
+        try:
+            return action(*arguments)
+        except Unanswered as error:
+            if time.monotonic() > deadline:
+                raise StorageError(f"{error}; finished episodes are kept, the same command goes on") from error
+            time.sleep(min(1.0, PATIENCE_SECONDS / 10))
