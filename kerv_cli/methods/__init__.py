@@ -1,4 +1,4 @@
-"""Decoding methods, with one file or folder per family (docs/methods.md).
+"""Decoding methods, with one file or folder per family (docs/methods.md). *Ours* marks what comes from no paper.
 
     ar                          autoregressive decoding (AR): no drafts
     spec_vla                    Spec-VLA: accept a draft token that equals the target's token, or is at most r bins off
@@ -11,15 +11,8 @@
     merged                      ours: several drafts in one tree, before the prefill (`method=one_pass`)
     motion                      ours: accept FAST tokens, and stop decoding, by the motion that the tokens stand for
 
-Each file above, and the `__init__.py` of each folder, contains the parts of its family, with their settings. Importing
-these files imports neither torch nor numpy. Code that needs torch or numpy, such as a drafter's network, is in another
-file, which is imported when the part is built.
-
-*Ours* marks what comes from no paper.
-
-`compose.py` builds a decoder from a method's parts. `context.py` defines the context in which a part is built.
-`artifacts.py` finds, checks and loads files. `drafters.py` has the base class of drafters with weights.
-`calibration.py` describes the file of calibrated numbers that KERV and HeiSD share.
+Importing these files, and the `__init__.py` of these folders, imports neither torch nor numpy. Code that needs them is
+in other files, which are imported when the part is built. `compose.py` builds a decoder from a method's parts.
 """
 
 from __future__ import annotations

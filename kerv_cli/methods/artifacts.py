@@ -28,8 +28,7 @@ TARGET = "target"
 
 
 T = TypeVar("T")
-_LOADED: dict[tuple[Any, ...], Any] = {}
-"""Artifacts that this process has loaded. The key holds everything on which a loaded artifact depends."""
+_LOADED: dict[tuple[Any, ...], Any] = {}  # the key holds everything on which a loaded artifact depends
 
 
 @dataclass(frozen=True)
@@ -47,13 +46,7 @@ class Use:
 
 @dataclass(frozen=True)
 class MadeFor:
-    """What identifies the target that an artifact was made for.
-
-    Attributes:
-        sha256: Hash of the target's weights.
-        actions: The target's action space.
-        chunk: The target's number of control steps per chunk. If 0, the artifact works with any number.
-    """
+    """What identifies the target that an artifact was made for. If `chunk` is 0, the artifact works with any number."""
 
     sha256: str
     actions: ActionSpace
@@ -66,7 +59,6 @@ class MadeFor:
 
 def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str, again: str) -> None:
     """Refuse an artifact that was made from other versions of the policy's target or artifacts (hashes by kind)."""
-    """Refuse an artifact that was made from other versions of the policy's target or artifacts."""
     for kind, digest in sources.items():
         if used.get(kind, digest) != digest:
             noun = kind if kind == TARGET else kind_of(kind).noun
@@ -76,9 +68,8 @@ def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str
 class Artifact(Generic[T]):
     """Base class of the kinds of artifacts, such as drafter, datastore and calibration.
 
-    An artifact is made for one target. It consists of files that methods read. One of these is a JSON file with the
-    fields of the dataclass `schema`, which describes the artifact. Drafters with weights derive from the subclass
-    `TrainableDrafter` (`drafters.py`).
+    An artifact is made for one target. One of its files is a JSON file with the fields of the dataclass `schema`.
+    Drafters with weights derive from `TrainableDrafter` (`drafters.py`).
 
     Attributes:
         kind: Name of the kind in settings and paths, such as `drafter`.
@@ -86,7 +77,6 @@ class Artifact(Generic[T]):
         made: Word that messages use for how such an artifact was made, such as `trained`.
         command: Command-line arguments after `kerv` that make such an artifact. Empty if no command makes it.
         advice: Words that messages write before this command.
-        schema: Dataclass with the fields of the JSON file.
     """
 
     kind: str
@@ -100,7 +90,6 @@ class Artifact(Generic[T]):
         return f"{self.advice} 'kerv {' '.join((*self.command, *words))}'"
 
     def anew(self, *words: str) -> str:
-        """Return advice for an error message: how to replace an artifact that was made for another target."""
         return self.again(*words, "replace=true")
 
     def path(self, results: str, name: str | None, target: Path) -> Path:
@@ -114,7 +103,6 @@ class Artifact(Generic[T]):
         return self.checked(path, artifacts.description)
 
     def made_for(self, description: T) -> MadeFor:
-        """Return the hash, action space and chunk length of the target that the artifact was made for."""
         fields: Any = description
         return MadeFor(fields.target, fields.actions, fields.chunk)
 
@@ -124,7 +112,6 @@ class Artifact(Generic[T]):
 
     def check_use(self, description: T, use: Use) -> None:
         """Refuse a use for which the artifact lacks something. This base class allows every use."""
-        """Refuse a use that the artifact was not made for. This base class allows every use."""
 
     def is_complete(self, description: T, kinds: Collection[str]) -> bool:
         """Return whether it has all that a policy with artifacts of these `kinds` needs."""
@@ -164,16 +151,7 @@ class Artifact(Generic[T]):
 class Artifacts:
     """The target and the artifacts of one policy, checked and loaded on demand.
 
-    Args:
-        results: The results folder.
-        policy: Names of the target and the artifacts.
-        search: Settings of the search in a datastore. If None, the search is exact.
-        device: Device to load the weights to.
-        dtype: Number format to convert the weights to.
-
-    Raises:
-        UsageError: There is no such target.
-        UnknownName: `policy.artifacts` names a kind of artifact that does not exist.
+    `search` are the settings of the search in a datastore. If None, the search is exact.
     """
 
     def __init__(
@@ -199,7 +177,6 @@ class Artifacts:
 
     def new(self, kind: str, adds: bool = False) -> Path:
         """Return the path to which a command writes. `adds`: it only adds, which a shipped policy's artifact allows."""
-        """Return the path to which a command writes the policy's artifact of this kind."""
         name = self.policy.artifacts.get(kind)
         if name:
             check_name(name, f"policy.artifacts.{kind}:")
@@ -231,7 +208,6 @@ class Artifacts:
         return hashes
 
     def _again(self, files: Artifact[Any]) -> str:
-        """Return advice for an error message: how to replace an artifact, with all words of the command."""
         words = [f"policy.target={self.policy.target}"]
         for kind, name in self.policy.artifacts.items():
             if name:
@@ -255,7 +231,6 @@ class Artifacts:
 
 
 def kind_of(name: str) -> Artifact[Any]:
-    """Return the kind of artifact with this name, such as `drafter`."""
     kind: Artifact[Any] = ArtifactPart.find(name).built()
     return kind
 

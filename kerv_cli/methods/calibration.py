@@ -25,7 +25,7 @@ AGAIN = "run 'kerv calibrate replace=true' with the same policy.target= and poli
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """The demonstrations of a calibration: their hash, and per task `{"training": number of episodes}`."""
+    """The demonstrations of a calibration. `tasks` is per task `{"training": number of episodes}`."""
 
     sha256: str
     tasks: dict[str, dict[str, int]]
@@ -37,7 +37,6 @@ class Variability:
 
     Attributes:
         k_s: Reference level K_S: the median K over the measured decodes, normalised action units.
-        decodes: Number of measured decodes.
         levels: Median of K by its name in `MEASURES`. Empty in calibrations before version 1.1.
     """
 
@@ -58,12 +57,10 @@ class BoundarySection:
 class SkipLevel:
     """The similarity (cosine) s_min at which verification of a task is skipped (docs/methods.md §4.3).
 
-    A match is a datastore entry and the most similar entry of another episode.
+    A match is a datastore entry and the most similar entry of another episode. A skip rule may move s_min from `low` to
+    `high`.
 
     Attributes:
-        s_min: A stored chunk is executed without verification from this similarity on.
-        low: Lowest value to which a skip rule may move s_min.
-        high: Highest such value.
         share: Share of the matches that are at least so similar.
         entries: Number of matches.
         within: Share of good ones among these. None if there are none.
@@ -87,7 +84,6 @@ class SkipSection:
         datastore: Hash of the datastore.
         epsilon: A match is good up to this mean absolute difference of the chunks, normalised action units.
         confidence: Minimum share of good matches from s_min on.
-        tasks: s_min of each task.
     """
 
     datastore: str
@@ -134,7 +130,6 @@ class Calibration:
         return row.levels.get(measure, row.k_s)
 
     def ranges(self, window: int) -> BoundaryRanges:
-        """Return the ranges of radius of curvature and path length, for a boundary that sees `window` positions."""
         if self.boundary is None:
             raise CheckpointError(f"the calibration has no ranges for the boundary: {AGAIN}")
         windows = self.boundary.windows
@@ -148,8 +143,7 @@ class Calibration:
     def skip_levels(self, task: str, datastore: str) -> tuple[float, float, float]:
         """Return the similarity s_min at which the task skips verification, and its bounds, as (low, s_min, high).
 
-        A skip rule may change s_min after each episode, between low and high. If the task never skips verification, all
-        three numbers are NEVER, which is above every similarity.
+        If the task never skips verification, all three are NEVER, which is above every similarity.
         """
         if self.skip is None:
             raise CheckpointError(f"the calibration has no skip levels: build a datastore, then {AGAIN}")
@@ -164,7 +158,7 @@ class Calibration:
 
 
 class CalibrationArtifact(Artifact[Calibration]):
-    """Finds, checks and loads calibrations. A calibration is a single file. Every `path` is the path of that file."""
+    """Finds, checks and loads calibrations. Every `path` is the path of the single file."""
 
     kind = noun = "calibration"
     made, command = "made", ("calibrate",)

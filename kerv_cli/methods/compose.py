@@ -43,7 +43,6 @@ class Method:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """The kinds of artifacts that the parts need, such as `drafter`, without repetitions."""
         kinds: list[str] = []
         for kind, part in self.parts.items():
             kinds += part.needed(self.settings[kind])
@@ -118,7 +117,6 @@ class Method:
 
     def decoder(self, target: Target, artifact: Callable[[str], Any], task: str = "") -> Decoder:
         """Build the decoder. `artifact` returns the loaded artifact of a kind, for the kinds in `needs` alone."""
-        """Build the decoder of this method for a target."""
         from kerv_cli.engine.decoder import Decoder, Parts
 
         self.check(target)

@@ -1,8 +1,4 @@
-"""The context in which a method's part is built.
-
-Each part registers a function that takes (settings, context) and returns the part. If the function returns None, the
-method has no part of this kind. For example, without a skip rule every draft is verified.
-"""
+"""The context in which a method's part is built."""
 
 from __future__ import annotations
 

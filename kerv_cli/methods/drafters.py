@@ -32,10 +32,8 @@ class DrafterDescription(checkpoint.Description):
 
     Attributes:
         target: Hash of the target's weights.
-        actions: The target's action space.
         chunk: The target's number of control steps per chunk. If 0, the drafter works with any number.
         settings: Settings of the network's shapes and of the training.
-        provenance: How the drafter was made.
     """
 
     target: str
@@ -47,10 +45,9 @@ class DrafterDescription(checkpoint.Description):
 
 @dataclass(frozen=True)
 class Decodes(Rows):
-    """Training examples of a drafter: the tokens that the target decodes greedily from n observations.
+    """Training examples of a drafter: the tokens that the target decodes greedily from n observations, by episode.
 
-    The observations are in the order of their episodes. Each kind of drafter has a subclass that adds the inputs of its
-    network.
+    Each kind of drafter has a subclass that adds the inputs of its network.
 
     Attributes:
         tokens: (n, N) int64, the N tokens of each chunk.
@@ -70,10 +67,9 @@ def evenly(steps: np.ndarray, share: float) -> np.ndarray:
 
 
 class TrainableDrafter(Artifact[DrafterDescription]):
-    """Base class of the drafters that are trained, such as the early drafter. A subclass is one kind of drafter.
+    """Base class of the drafters that are trained, such as the early drafter. `DrafterPart` registers a subclass.
 
-    The subclass defines the network, its training and its proposer. `DrafterPart` registers it. A trained
-    drafter is a folder with the weights in safetensors and a description `<kind>.json`.
+    A trained drafter is a folder with the weights in safetensors and a description `<kind>.json`.
 
     Attributes:
         settings: Dataclass of the settings, which are shapes of the network and parameters of the training.
@@ -86,7 +82,6 @@ class TrainableDrafter(Artifact[DrafterDescription]):
 
     @property
     def command(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Command-line arguments after `kerv` that train such a drafter."""
         return "train", "drafter", f"drafter={self.settings().kind}"
 
     @abstractmethod
@@ -100,9 +95,7 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         """Decode about `settings.samples` observations with the target, spread evenly over all episodes.
 
         Args:
-            target: The loaded target, on the device to train on.
             dataset: The demonstrations. The expert's actions are not used.
-            settings: Settings of the drafter.
             held_out: Share of the episodes to hold out.
             progress: Called with the number of episodes done and the number of all episodes.
 
@@ -132,8 +125,6 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         """Decode some observations of an episode greedily with the target.
 
         Args:
-            target: The loaded target.
-            episode: The episode.
             steps: (n,) control steps of the observations.
             space: Observation space of the demonstrations.
             columns: Values of the result's fields `episodes` and `perturbed`.
@@ -148,7 +139,6 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         """Return the loss (a scalar) of a batch of examples, and metrics to log.
 
         Args:
-            network: The network to train.
             target: The frozen target that the drafter imitates.
             batch: Some of the training examples.
             step: The optimisation step.
@@ -157,24 +147,15 @@ class TrainableDrafter(Artifact[DrafterDescription]):
 
     @abstractmethod
     def validate(self, network: Any, target: Any, held_out: Any, settings: Any) -> Metrics:
-        """Return metrics of a network. The best weights are those with the highest `score`.
+        """Return metrics of a network on held-out examples. The best weights are those with the highest `score`.
 
-        Args:
-            network: The network.
-            target: The target that the drafter imitates.
-            held_out: Examples from episodes that the network was not trained on.
-            settings: Settings of `kerv train drafter`: `drafter` for the drafter, `train` for the optimisation.
+        `settings` are those of `loss`.
         """
 
     @classmethod
     @abstractmethod
     def proposer(cls, settings: Any, context: Context) -> Proposer:
-        """Return the proposer that drafts with the network `context.artifact(kind)`.
-
-        Args:
-            settings: Settings of the proposer.
-            context: The context in which the method is built.
-        """
+        """Return the proposer that drafts with the network `context.artifact(kind)`."""
 
     def load(self, path: Path, artifacts: Artifacts) -> Any:
         """Load the network with frozen weights, on the target's device and in the target's number format."""
@@ -183,11 +164,9 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         return load_compiled(self.network(settings, target), path, self.kind, target.device, target.dtype)
 
     def digest(self, path: Path, description: DrafterDescription) -> str:
-        """Return the hash of the weights."""
         return description.sha256
 
     def described(self, file: Path) -> DrafterDescription:
-        """Read the description in a file, and check the hash of the weights beside it."""
         return checkpoint.read_description(file.parent, self.kind, self.schema)
 
     def save(
@@ -199,18 +178,11 @@ class TrainableDrafter(Artifact[DrafterDescription]):
         stored: str = checkpoint.FLOAT32,
         **fields: Any,
     ) -> str:
-        """Write the weights and the description.
+        """Write the weights and the description, and return the hash of the weights.
 
         Args:
-            path: Folder to write to.
-            module: The network.
-            made_for: The target that the network drafts for.
-            provenance: How the drafter was made.
             stored: Number format of the weights on disk: `float32`, `float16` or `int8`.
             fields: Further fields of the description, if this kind of drafter has any.
-
-        Returns:
-            The hash of the weights.
         """
         shared = {"target": made_for.sha256, "actions": made_for.actions.as_dict(), "provenance": dict(provenance)}
         chunk = {} if self.any_chunk else {"chunk": made_for.chunk}

@@ -42,7 +42,6 @@ class MergedProposerSettings:
 
 
 def needs_of_sources(settings: MergedProposerSettings) -> tuple[str, ...]:
-    """Return the kinds of artifacts that the proposers in `sources` and `fallback` need, without repetitions."""
     kinds: list[str] = []
     for name in (*settings.sources, *settings.fallback):
         part = ProposerPart.find(name)
@@ -54,15 +53,9 @@ def needs_of_sources(settings: MergedProposerSettings) -> tuple[str, ...]:
     "merged", MergedProposerSettings, needs=needs_of_sources, colour=0xCC79A7, when=PREFILL, merged=True, cost="early"
 )
 class MergedProposer(ChainProposer):
-    """Merges the drafts of several proposers into one prefix tree of at most `nodes` nodes.
+    """Merges the drafts of several proposers into one prefix tree. If it has more than `nodes`, the last drafts go.
 
-    Each draft is a chain, which is a plain sequence of tokens. If the tree has too many nodes, the last chains are
-    dropped.
-
-    Args:
-        sources: Proposers that always draft.
-        nodes: Maximum number of nodes of the tree.
-        fallback: Proposers that draft only if no source expects its whole chunk to be accepted.
+    Those in `fallback` draft only if no source expects its whole chunk to be accepted.
     """
 
     def __init__(self, sources: Sequence[ChainProposer], nodes: int, fallback: Sequence[ChainProposer] = ()) -> None:

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 
 def code_of(context: Context, part: str) -> FastCode:
-    """Return the target's FAST code, which turns tokens into the motion of a whole chunk."""
     code = context.target.actions.code
     if code is None:
         raise UsageError(f"{part}: this target's tokens are bins; it is for a target with target.code=fast")
@@ -74,7 +73,7 @@ class MotionRule(DistanceRule):
     def difference(self, before: Sequence[int], token: int, other: int) -> float:
         """Return the largest difference between the normalised actions of two motions.
 
-        The first motion is decoded from the tokens `before` and `token`, the second from `before` and `other`.
+        They are decoded from the tokens `before`, followed by `token` and by `other`.
         """
         import numpy as np
 
@@ -110,10 +109,7 @@ class CoarseBoundarySettings:
 
 @BoundaryPart("coarse", CoarseBoundarySettings, any_code=True)
 class Coarse(Boundary):
-    """Ends every chunk after at most `tokens` FAST tokens.
-
-    The tokens after that would give the coefficients of the highest frequencies. These coefficients count as zero.
-    """
+    """Ends every chunk after at most `tokens` FAST tokens. Coefficients of higher frequencies count as zero."""
 
     @classmethod
     def build(cls, settings: Any, context: Context) -> Coarse:

@@ -35,9 +35,6 @@ class JacobiProposer(ChainProposer):
     With strict acceptance the result equals the tokens of autoregressive decoding. If a prefill draft was rejected, the
     first guess begins with the target's tokens after the rejection. All other tokens of the first guess are the end
     token, or the middle token (normalised action 0) if chunks have no end token.
-
-    Attributes:
-        guess: The current guess of the remaining tokens.
     """
 
     name = "jacobi"
@@ -69,9 +66,9 @@ class LookupProposerSettings:
 class LookupProposer(ChainProposer):
     """Searches the last chunk for the newest committed tokens, and drafts the tokens that followed there.
 
-    The newest `longest` tokens are searched for first. If they do not occur, fewer tokens are searched for. If they
-    occur several times, the occurrence nearest to the current index in the chunk wins. If not even the newest token
-    occurs, or if no token is committed yet, the draft is the last chunk's tokens from the current index on.
+    If the newest `longest` tokens do not occur, fewer are searched for. If they occur several times, the occurrence
+    nearest to the current index in the chunk wins. If nothing is found, or no token is committed yet, the draft is the
+    last chunk's tokens from the current index on.
     """
 
     name = "lookup"
@@ -96,7 +93,6 @@ class LastActionProposer(ChainProposer):
     name = "last_action"
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        """Return one chain of at most `depth` tokens. There is none before an episode's first action."""
         import numpy as np
 
         space, episode = chunk.space, chunk.episode

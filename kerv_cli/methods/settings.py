@@ -15,10 +15,7 @@ MODEL, EXPERT, REMOTE = "model", "expert", "remote"
 
 @dataclass
 class PolicySettings:
-    """The policy that chooses the actions.
-
-    Target and artifacts are chosen by the name of a folder in results/pretrained or results/artifacts, or by a path.
-    """
+    """The policy that chooses the actions. Files are chosen by the name of a folder in results/, or by a path."""
 
     # expert: the environment's scripted policy, without decoding; remote: the policy behind `url`
     kind: str = choice(MODEL, MODEL, EXPERT, REMOTE, help="what decodes: weights, a script, or a server")

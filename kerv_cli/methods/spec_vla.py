@@ -31,11 +31,7 @@ class RelaxedAcceptanceSettings:
 @AcceptancePart("relaxed", RelaxedAcceptanceSettings)
 @dataclass(frozen=True)
 class RelaxedRule(DistanceRule):
-    """Accepts a draft token if it is at most r bins from the target's token.
-
-    Attributes:
-        strict_dofs: Whether tokens of strict DoFs, such as the gripper, must equal the target's.
-    """
+    """Accepts a draft token at most r bins from the target's token. With `strict_dofs`, strict DoFs must be equal."""
 
     strict_dofs: bool = True
 

@@ -22,17 +22,14 @@ if TYPE_CHECKING:
     from kerv_cli.engine.protocol import ParallelTarget
     from kerv_cli.methods.context import Context
 
+# values of `DecodeRecord.reason`; TRUSTED: the draft was executed without verification; STREAK: it was not, because no
+# further decode without verification was allowed, or because the draft was incomplete
 TRUSTED, STREAK = "trusted", "streak"
-"""Values of `DecodeRecord.reason`. TRUSTED: the draft was executed without verification. STREAK: the target verified or
-decoded the chunk, because no further decode without verification was allowed, or because the draft was incomplete."""
 
 
 @SkipPart("parallel", colour=0x17BECF, verifies=False, batchable=True)
 class ParallelPass(Skip):
-    """Decodes all tokens of a chunk in one bidirectional forward of a parallel target.
-
-    Each token is chosen without knowing the others, and no token is verified.
-    """
+    """Decodes all tokens of a chunk in one bidirectional forward of a parallel target. No token is verified."""
 
     phase = "prefill"
 
@@ -73,14 +70,13 @@ class StreakSkipSettings:
 
 @SkipPart("streak", StreakSkipSettings, colour=0xE8C547, takes_draft=True, merges=True)
 class StreakSkip(Skip):
-    """Executes drafts without verification, as long as verified drafts agree with the target.
+    """Executes drafts without verification, as long as verified drafts agree with the target (docs/methods.md §4.5).
 
     After the first verified chunk that agrees with its draft, the next decode is not verified. Each further agreement
     doubles the number of unverified decodes that follow, up to the setting `most`. A chunk that does not agree with its
     draft resets the number to 0. An episode starts with `opening` decodes without verification.
 
     Attributes:
-        source: The proposer of the drafts.
         allowed: Number of unverified decodes that the last verification allowed.
         left: How many of the allowed decodes are still to come.
         chain: The draft of the current chunk.

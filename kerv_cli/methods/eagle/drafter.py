@@ -1,9 +1,8 @@
 """The EAGLE-style drafter: network, dynamic tree, training and files (docs/methods.md §2.2; EAGLE-2; Spec-VLA §3).
 
-The input at position i is the embedding of token i + 1, concatenated with the target's last hidden state at i. A linear
-layer maps it to the target's width. The drafter predicts the hidden state at i + 1. From this state the target's frozen
-head computes the logits of token i + 2. The drafter's cache holds the whole prompt, and rotary positions count from the
-prompt's beginning.
+The input at position i is the embedding of token i + 1, concatenated with the target's last hidden state at i. The
+output is the hidden state at i + 1, from which the target's frozen head computes the logits of token i + 2. The
+drafter's cache holds the whole prompt, and rotary positions count from the prompt's beginning.
 
 Shapes: B sequences, T new tokens, P prompt tokens, N tokens of a chunk, E width of the target.
 """
@@ -41,8 +40,7 @@ from kerv_cli.targets.compact.trunk import LayerStack
 from kerv_cli.targets.observations import observations_of, prompts_of
 from kerv_cli.worlds.demos.files import DemoEpisode
 
-VALIDATED = 60
-"""Maximum number of held-out observations that a validation decodes."""
+VALIDATED = 60  # maximum number of held-out observations that a validation decodes
 
 
 class EagleNetwork(DraftNetwork, LayerStack):
@@ -59,10 +57,7 @@ class EagleNetwork(DraftNetwork, LayerStack):
         return self.fuse(torch.cat(inputs, -1))
 
     def joined(self, target: Any, tree: bool) -> Any:
-        """Return a compiled program that drafts level after level, with the target's embeddings and head.
-
-        Return None if this drafter or the target is not compiled.
-        """
+        """Return a compiled program that drafts level after level. None if drafter or target is not compiled."""
 
         def step(hidden: Any) -> Tensor:
             logits = target.head(hidden)
@@ -77,9 +72,7 @@ class DrafterProposer(Proposer):
     """Drafts a chain or a dynamic tree (docs/methods.md §2.2). The drafts stay on the GPU, so the CPU need not wait.
 
     Attributes:
-        depth: Maximum number of tokens on a path.
         top_k: Number of nodes per depth that get children, and number of children of each. If 1, the draft is a chain.
-        nodes: Maximum number of nodes. The most probable nodes are kept.
         cache: Keys and values of the drafter, for all committed positions except the last.
         hidden: (E,) predicted hidden state. The target's head computes the first draft token from it.
     """
@@ -108,7 +101,6 @@ class DrafterProposer(Proposer):
         self.observe(self.embed(chunk.tokens[first + 1 :]), hidden, chunk.target.prompt_length + first)
 
     def embed(self, tokens: list[int]) -> Tensor:
-        """Return the target's embeddings of T tokens, (1, T, E)."""
         return self.target.embed(upload([tokens], self.target.device))
 
     def observe(self, following: Tensor, hidden: Tensor, first: int) -> None:
@@ -195,11 +187,7 @@ class EagleExamples(Decodes):
 
 @dataclass(frozen=True, kw_only=True)
 class EagleDescription(DrafterDescription):
-    """Contents of the JSON file beside an EAGLE-style drafter's weights.
-
-    Attributes:
-        public: Shape of a drafter in the published layout. None if the drafter has our own layout.
-    """
+    """Contents of the JSON file beside the weights. `public` is None for a drafter in our own layout."""
 
     public: PublicShape | None = None
 
@@ -263,9 +251,9 @@ class EagleDrafter(TrainableDrafter):
     ) -> tuple[Tensor, Metrics]:
         """Return the loss and the metrics to log, for B examples with prompts of one length.
 
-        The first pass reads the target's hidden states. Each later pass reads the drafter's own predictions of the pass
-        before, as in drafting. The loss of a pass is the weighted sum of two losses: the smooth L1 loss of the states,
-        and the cross-entropy of the drafter's token distribution with the target's. The result is the mean over passes.
+        The first pass reads the target's hidden states, later passes the drafter's predictions of the pass before, as
+        in drafting. A pass's loss is the weighted sum of the smooth L1 loss of the states and the cross-entropy of the
+        drafter's token distribution with the target's. The result is the mean over passes.
         """
         device = target.device
         tokens = rows.tokens.to(device)

@@ -53,7 +53,6 @@ class PublicShape:
     Attributes:
         language: Sizes of the drafter's Llama layer.
         bias: Whether `fc` has a bias.
-        convention: How the drafter differs from our own.
         skipped: Number of vision tokens in the target's prompt. With `positions=text`, positions do not count them.
     """
 
@@ -64,7 +63,7 @@ class PublicShape:
 
 
 class DraftCache(Cache):
-    """Cached keys and values of a drafter. The attribute `prompt` is the number of prompt tokens."""
+    """Keys and values of a drafter. `prompt` is the number of prompt tokens."""
 
     prompt = 0
 
@@ -93,7 +92,6 @@ class DraftNetwork(nn.Module):
             following: (B, T, E) embedding of the token after each position.
             hidden: (B, T, E) hidden states at the positions.
             positions: (T,) rotary positions.
-            cache: Keys and values of earlier tokens. If None, there are none.
             seen: Attention mask (T, M) bool over the last M tokens. If None, attention is causal.
         """
         return self.run((following, hidden), positions, cache, seen)
@@ -116,8 +114,7 @@ class PublicDrafter(DraftNetwork):
     def run(self, inputs: Sequence[Tensor], positions: Tensor, cache: Any, seen: np.ndarray | Tensor | None) -> Tensor:
         """Compute what `forward` returns. `inputs` are its first two arguments.
 
-        With `mask=prompt`, a query sees a key only if the key is one of the prompt's first P − 1 tokens and `seen`
-        allows it.
+        With `mask=prompt`, a query sees only the prompt's first P − 1 tokens, and of these only what `seen` allows.
         """
         if cache is not None and not cache.length:
             cache.prompt = inputs[0].shape[1]

@@ -1,8 +1,5 @@
 """The early drafter: network, proposer and training (docs/methods.md §5, ours).
 
-It drafts a whole chunk from the encoded prompt, before the target's trunk runs. A residual network turns the pooled
-prompt into a few features per token, and one head turns the features into logits over the bins.
-
 Shapes: B prompts, F features of a pooled prompt, N tokens of a chunk, V bins, which are the possible tokens.
 """
 
@@ -32,11 +29,9 @@ from kerv_cli.targets.losses import labels_of, token_loss, within_chunk
 from kerv_cli.targets.observations import observations_of, prompts_of
 from kerv_cli.worlds.demos.files import DemoEpisode
 
+# the drafter is sure of a chunk if it estimates at least this probability that all tokens are accepted; the estimate is
+# too low: 89 % of such chunks were accepted whole (mt10-vision, radius 9)
 SURE = 0.05
-"""The early drafter is sure of a chunk if it estimates at least this probability that all tokens are accepted.
-
-The estimate is lower than the true probability: 89 % of such chunks were accepted whole (mt10-vision, radius 9).
-"""
 
 
 class Block(nn.Module):
@@ -55,7 +50,7 @@ class Block(nn.Module):
 
 
 class EarlyNetwork(Compilable):
-    """A residual network from the pooled prompt (F features) to the logits of a chunk (N tokens, V bins)."""
+    """A residual network from the pooled prompt to a few features per token, of which one head makes logits."""
 
     mean: Tensor  # (F,) mean of the training features
     scale: Tensor  # (F,) 1 / standard deviation of the training features
@@ -79,13 +74,11 @@ class EarlyNetwork(Compilable):
     def new_program(self) -> Program:
         return Program(self.logits, (1, len(self.mean)))
 
-    def standardise(self, features: Tensor) -> None:
-        """Set the mean and the scale by which inputs are standardised, from the training features (n, F)."""
+    def standardise(self, features: Tensor) -> None:  # (n, F) training features
         self.mean.copy_(features.float().mean(0))
         self.scale.copy_(1.0 / features.float().std(0).clamp_min(1e-3))
 
     def forward(self, features: Tensor) -> Tensor:
-        """Return the logits (B, N, V) for pooled prompts (B, F), by the compiled network if there is one."""
         return self.compiled(features)[0] if self.compiled and self.runs_compiled(features) else self.logits(features)
 
     def logits(self, features: Tensor) -> Tensor:
@@ -99,8 +92,7 @@ class EarlyNetwork(Compilable):
     def draft(self, features: Tensor, radius: int) -> Tensor:
         """Draft chunks for pooled prompts (B, F) and an acceptance radius in bins.
 
-        Returns:
-            (B, N + 1) float64 on the device: the N tokens, then the estimated probability that all are accepted.
+        Returns (B, N + 1) float64 on the device: the N tokens, then the estimated probability that all are accepted.
         """
         tokens, odds = choose(self(features.to(self.head.weight.dtype)), radius, self.strict)
         return torch.cat([tokens.double(), odds.double()[:, None]], -1)
@@ -109,13 +101,9 @@ class EarlyNetwork(Compilable):
 def choose(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tensor, Tensor]:
     """Choose the tokens that are most likely to be accepted, and estimate the probability that all are accepted.
 
-    A token is accepted if the target's token is at most `radius` bins away. So the best bin is the bin with the most
-    probability in this range around it. The best bin need not be the most probable bin. If several bins are about
-    equally good, the bin with more probability close to it wins, because it is likely nearer to the target's token. For
-    a strict token the most probable bin is chosen.
-
-    The estimate treats tokens as independent, and training on soft labels makes the estimate too low. Use it only to
-    compare chunks.
+    The best bin has the most probability within `radius` bins around it. Of about equally good bins, the one with more
+    probability close to it wins, because it is likely nearer to the target's token. A strict token is the most probable
+    bin. The estimate is too low: it treats tokens as independent. Use it only to compare chunks.
 
     Args:
         logits: (B, N, V).
@@ -153,7 +141,7 @@ class EarlyProposer(ChainProposer):
     def compile(self) -> Program | None:
         """Return a compiled program that computes the result of `row` from a radius (1, 1) and a prompt.
 
-        Return None if the drafter is not compiled, or if drafter and target cannot be compiled together.
+        None if the drafter is not compiled, or if drafter and target cannot be compiled together.
         """
         early: Any = self.early
         target: Any = self.target
@@ -165,18 +153,13 @@ class EarlyProposer(ChainProposer):
         return target.join(row, (1, 1), (1, target.max_prompt, target.width)) if joins else None
 
     def drafted(self, chunk: Chunk) -> tuple[list[int], float]:
-        """Return the draft of the chunk's N tokens, and the estimated probability that all are accepted."""
         if self._drafted is None or self._drafted[0] is not chunk:
             numbers = read(self.row(chunk, max(chunk.limits, default=0)))[0]
             self._drafted = chunk, numbers[:-1].astype(np.int64).tolist(), float(numbers[-1])
         return self._drafted[1:]
 
     def row(self, chunk: Chunk, radius: int) -> Tensor:
-        """Draft the tokens of a chunk that are most likely to be accepted with this acceptance `radius`, in bins.
-
-        Returns:
-            (N + 1,): the N tokens, then the estimated probability that all of them are accepted.
-        """
+        """Draft a chunk for an acceptance radius in bins: (N + 1,), the result of `EarlyNetwork.draft`."""
         if self.compiled is not None:
             return self.compiled(torch.tensor([[radius]]), chunk.target.prompt)[0][0]
         return self.early.draft(self.target.pooled(chunk.target.prompt), radius)[0]
@@ -196,10 +179,7 @@ class EarlyExamples(Decodes):
 
 
 class EarlyDrafter(TrainableDrafter):
-    """Early drafters, which are artifacts of the kind `early`.
-
-    They learn the target's greedy tokens, with labels spread over neighbouring bins.
-    """
+    """Early drafters. They learn the target's greedy tokens, with labels spread over neighbouring bins."""
 
     kind, noun = "early", "early drafter"
     settings = EarlySettings
@@ -255,9 +235,8 @@ def measure(logits: Tensor, examples: Decodes, strict: Tensor, end: int | None =
         end: The token that ends a chunk. Tokens after it are not counted. None if chunks have no such token.
 
     Returns:
-        For each radius the mean number of accepted tokens, and the share of drafts of which all tokens are accepted.
-        Also the token accuracy: the share of the drafter's most probable tokens that equal the target's. In each mean,
-        perturbed episodes together weigh as much as all other episodes together.
+        For each radius the mean number of accepted tokens and the share of fully accepted drafts. Also the token
+        accuracy. In each mean, perturbed episodes together weigh as much as all other episodes together.
     """
     kinds = [mask for mask in (examples.perturbed, ~examples.perturbed) if mask.any()]
 

@@ -1,9 +1,4 @@
-"""HeiSD (docs/methods.md §2.1, §4): drafts by retrieval or by the drafter, and skipped verification.
-
-A boundary chooses for each chunk whether retrieval or the drafter drafts. Retrieved drafts are accepted or rejected by
-kinematic group (position, rotation, gripper). If a stored observation is similar enough, its chunk is executed without
-verification.
-"""
+"""HeiSD (docs/methods.md §2.1, §4): drafts by retrieval or by the drafter, and skipped verification."""
 
 from __future__ import annotations
 
@@ -55,7 +50,6 @@ class Index(ABC):
     """
 
     def __init__(self, store: Datastore, settings: Any) -> None:
-        """Keep the datastore. `settings` configures the search."""
         self.store = store
 
     @abstractmethod
@@ -64,8 +58,6 @@ class Index(ABC):
 
         Args:
             key: (d,) float32, the key to compare with.
-            task: Full name of the task.
-            k: Number of rows wanted.
             without: Seed of an episode to leave out. If None, use all episodes.
         """
 
@@ -161,8 +153,7 @@ class HybridProposerSettings(DrafterProposerSettings):
 class HybridProposer(Proposer):
     """HeiSD: drafts by retrieval or with the drafter, as the boundary chooses for each chunk (docs/methods.md §4.4).
 
-    Attributes:
-        name: Name of the proposer that drafts the current chunk.
+    `name` is the name of the proposer that drafts the current chunk.
     """
 
     def __init__(self, drafter: Proposer, retrieval: Proposer) -> None:
@@ -209,10 +200,6 @@ class GroupRule(DistanceRule):
     """Accepts or rejects each kinematic group (position, rotation, gripper) of a control step as a whole.
 
     Strict DoFs, such as the gripper, must equal the target's tokens.
-
-    Attributes:
-        group_limit: Largest accepted sum of a group's distances to the target's tokens, in bins.
-        token_limit: Largest accepted distance of one token, in bins.
     """
 
     group_limit: int
@@ -241,14 +228,7 @@ class HybridAcceptanceSettings(SequenceAcceptanceSettings):
 @registry.AcceptancePart("hybrid", HybridAcceptanceSettings)
 @dataclass(frozen=True, kw_only=True)
 class HybridRule(RelaxedRule):
-    """Uses two rules: one for retrieved drafts, and one for all other drafts.
-
-    In a retrieved draft, each kinematic group (position, rotation, gripper) is accepted or rejected as a whole
-    (`GroupRule`). In any other draft, each token is accepted if it is within the radius r (`RelaxedRule`).
-
-    Attributes:
-        retrieved: The rule for retrieved drafts.
-    """
+    """Uses `GroupRule` for retrieved drafts, and `RelaxedRule` for all other drafts."""
 
     retrieved: GroupRule
 
@@ -331,14 +311,7 @@ class FusedBoundarySettings:
     idle=lambda settings: {} if settings.f_star is None else {"quantile": "boundary.f_star names the limit"},
 )
 class Fused(Boundary):
-    """Chooses retrieval if F ≥ F*. F is the weighted sum of the radius of curvature and the length of the hand's path.
-
-    With fewer than three positions the drafter is chosen.
-
-    Attributes:
-        ranges: Ranges by which radius and length are scaled to [0, 1], before they are added.
-        f_star: The limit F*.
-    """
+    """Chooses retrieval if F ≥ F*. With fewer than three positions it chooses the drafter."""
 
     def __init__(self, settings: FusedBoundarySettings, context: Context) -> None:
         super().__init__(settings)
@@ -380,10 +353,6 @@ class VerifySkip(Skip):
     At most `max_skips` chunks in a row are executed without verification. If the method has a boundary, the boundary
     must choose retrieval. Once the last chunk of a stored episode has been executed, no chunk of that stored episode
     is executed without verification in the rest of the robot's own episode.
-
-    If the setting `up` or `down` is above 0, s_min changes after each episode. Let R be the calibrated range of s_min,
-    high − low. A failure raises s_min by up · R, a success lowers it by down · R. Then results depend on the order of
-    the episodes.
     """
 
     def __init__(

@@ -67,12 +67,9 @@ class BoundaryRanges:
     def fit(cls, paths: Iterable[np.ndarray], window: int, known: BoundaryRanges | None = None) -> BoundaryRanges:
         """Measure the ranges over all windows of some episodes.
 
-        The first windows of an episode are shorter, as they are in a rollout.
-
         Args:
             paths: Measured hand positions of each episode, (T, 3) metres.
-            known: An older calibration's ranges. They are kept, and only the attribute `points` is measured. If None,
-                everything is measured.
+            known: An older calibration's ranges. They are kept, and only the attribute `points` is measured.
         """
         measured = []
         for path in paths:
@@ -112,12 +109,6 @@ class BoundaryRanges:
         return scaled, min(1.0, max(0.0, (length - self.length_low) / (self.length_high - self.length_low)))
 
     def fused(self, radius: float, length: float, alpha: float) -> float:
-        """Return F, the weighted sum of a path's scaled radius and scaled length, in [0, 1].
-
-        Args:
-            radius: Radius of curvature, metres.
-            length: Path length, metres.
-        """
         radius, length = self.normalise(radius, length)
         return alpha * radius + (1 - alpha) * length
 

@@ -1,13 +1,12 @@
 """The datastore: demonstrated chunks, found by similarity and merged into a draft tree (docs/methods.md §4.1, §4.2).
 
-Each entry has a key and a chunk. The key is the observation as the target encodes it. For each chosen segment of the
-prompt, the mean token is L2-normalised. These vectors are concatenated, and the result is normalised again. Optionally,
-keys are projected onto their leading directions. By default the key is made of the segment `scene` alone, which encodes
-hand, object and goal. On MT10 this key finds the most similar chunks of other episodes. A key with vision tokens finds
-less similar chunks. An entry's chunk is the expert's next H actions, as tokens.
+Each entry has a key and a chunk: the observation as the target encodes it, and the expert's next H actions as tokens.
+For each chosen segment of the prompt, the mean token is L2-normalised. These vectors are concatenated, and the result
+is normalised again. By default the key is made of the segment `scene` alone, which encodes hand, object and goal. On
+MT10 a key with vision tokens finds less similar chunks.
 
 A datastore is a folder with `vectors.npy` (rows, d) float32 or float16, `payload.parquet`, `manifest.json` and, if keys
-are projected, `projection.npy`. Rows are sorted by task, seed and step.
+are projected onto their leading directions, `projection.npy`. Rows are sorted by task, seed and step.
 
 Shapes: B observations, P prompt tokens, E width of the target, d numbers of a key.
 """
@@ -46,12 +45,7 @@ COLUMNS = {"seeds": "seed", "steps": "step", "left": "left"}
 
 @dataclass(frozen=True)
 class Shard:
-    """The entries of one task.
-
-    Attributes:
-        rows: The task's first row, and the row after its last row.
-        seeds: Seeds of the task's episodes.
-    """
+    """The entries of one task. `rows` are the task's first row, and the row after its last row."""
 
     rows: tuple[int, int]
     seeds: tuple[int, ...]
@@ -62,18 +56,14 @@ class Manifest:
     """Contents of a datastore's `manifest.json`.
 
     Attributes:
-        format: Version of the file format.
-        kind: Always `datastore`.
         key: Segments of the prompt from which keys are made, such as `scene`.
         width: Length d of a key.
         rows: Number of entries.
         chunk: Number H of control steps per chunk.
-        actions: The target's action space.
         target: Hash of the target's weights.
         demos: Hash of the demonstrations.
         files: Hash of each file beside the manifest, by name.
         tasks: Rows and seeds of each task, by the task's full name.
-        provenance: How the datastore was made.
     """
 
     format: Literal[2]
@@ -135,18 +125,14 @@ def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:
 
 
 def best(vectors: np.ndarray, rows: np.ndarray, key: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the k rows most similar to a key, and their similarities.
+    """Return the k rows most similar to a key, and their similarities, both (k,), most similar first.
 
-    Dot products are computed in float64, because the last bit of a float32 result depends on the row's index in the
-    matrix.
+    Dot products are in float64, because the last bit of a float32 result depends on the row's index in the matrix.
+    Equally similar rows are in ascending order.
 
     Args:
         vectors: (all rows, d) stored keys.
         key: (d,) search key.
-
-    Returns:
-        The rows (k,) and their similarities (k,) float32, most similar first. Fewer if there are fewer candidates.
-        Equally similar rows are in ascending order.
     """
     scores = np.einsum("ij,j->i", vectors[rows].astype(np.float64), key.astype(np.float64)).astype(np.float32)
     order = np.argsort(-scores, kind="stable")[:k]
@@ -190,11 +176,7 @@ class Datastore:
 
     @classmethod
     def open(cls, folder: Path, description: TargetDescription, search: Any = None) -> Datastore:
-        """Open a datastore, and check that it was built for a target.
-
-        Args:
-            search: Settings of the search. If None, the search is exact.
-        """
+        """Open a datastore, and check that it was built for a target. If `search` is None, the search is exact."""
         manifest = DatastoreArtifact().checked(folder, description)
         rows, size = manifest.rows, manifest.actions.longest(manifest.chunk)
         try:
@@ -217,21 +199,16 @@ class Datastore:
         return self.shards
 
     def key_of(self, prompt: Tensor, target: ReadableTarget) -> np.ndarray:
-        """Return the search key (d,) float32 of an observation, on the CPU.
-
-        Args:
-            prompt: (1, P, E) encoded prompt.
-        """
+        """Return the search key (d,) float32, on the CPU, of an encoded prompt (1, P, E)."""
         (pooled,) = read(prompt_key(prompt, target, self.manifest.key)[0])
         key = pooled.astype(np.float32, copy=False)
         return key if self.projection is None else projected(key[None], self.projection)[0]
 
     def query(self, key: np.ndarray, task: str, k: int, without: int | None = None) -> Neighbours:
-        """Return the k entries of a task that are most similar to a key, or all entries if there are fewer.
+        """Return the k entries of a task that are most similar to a key (d,), or all entries if there are fewer.
 
         Args:
-            key: (d,) search key.
-            without: Seed of an episode to leave out, for leave-one-episode-out measurements. If None, use all episodes.
+            without: Seed of an episode to leave out, for leave-one-episode-out measurements.
         """
         if task not in self.shards:
             raise UnknownName("task of the datastore", task, self.shards)
@@ -253,7 +230,7 @@ def _read_payload(path: Path) -> dict[str, np.ndarray]:
 
 
 class DatastoreArtifact(Artifact[Manifest]):
-    """Finds, checks and loads datastores. A datastore is a folder with demonstrated chunks, which `Datastore` opens."""
+    """Finds, checks and loads datastores."""
 
     kind = noun = "datastore"
     made, command, advice = "built", ("build", "datastore"), "build one with"
@@ -283,9 +260,8 @@ def neighbour_tree(
     """Merge the neighbours' chunks into one tree of kinematic groups (docs/methods.md §4.2).
 
     A kinematic group is the position, rotation or gripper tokens of one control step. Every path of the tree consists
-    of whole groups. After a group, a path may continue with the next group of any neighbour. There is one exception: if
-    the next group is strict (the gripper), it must come from a neighbour whose chunk also contains the path's last
-    group.
+    of whole groups. After a group, a path may continue with the next group of any neighbour. But if the next group is
+    strict (the gripper), it must come from a neighbour whose chunk also contains the path's last group.
 
     If the tree would be too large, only the most probable groups are kept (our addition to the paper). The i-th
     neighbour has the weight 1 / i, and a path changes to another neighbour with probability `cross`.
@@ -293,8 +269,7 @@ def neighbour_tree(
     Args:
         chunks: (k, N) tokens, most similar neighbour first.
         depth: Maximum number of tokens on a path. If None, paths end with the chunk.
-        cross: Probability that a path changes to another neighbour after a group. If 0, paths never change, so only
-            whole chunks are merged.
+        cross: If 0, paths never change, so only whole chunks are merged.
     """
     stop = chunks.shape[1] if depth is None else min(chunks.shape[1], start + depth)
     # sets of neighbours are numbers, whose bits stand for neighbours

@@ -43,10 +43,7 @@ class PredictorPart(ProposerPart):
 
 
 def predictor(settings: NoSettings, context: Context) -> Predictor:
-    """Build kerv's own predictor `settings.kind`. Its horizon is long enough for all control steps of a chunk.
-
-    The noise of a Kalman filter comes from the calibration.
-    """
+    """Build kerv's own predictor `settings.kind`, with a horizon of all control steps of a chunk."""
     from kerv_cli.methods.kerv.prediction import PREDICTORS, Kalman
 
     kind, held, horizon = PREDICTORS[settings.kind], context.target.actions.is_strict, context.target.chunk
@@ -63,12 +60,10 @@ PredictorPart("kalman", needs=_noise, colour=0xD55E00)(predictor)
 PredictorPart("walk", colour=0x999933)(predictor)
 
 ACCEPTED = "accepted"
-DRAFT = "draft"
-"""With this value of `rectifier.predictor`, the rejected draft's tokens fill the gap, not a kinematic prediction."""
+DRAFT = "draft"  # value of `rectifier.predictor`: the rejected draft's tokens fill the gap
 
 
 def find_predictor(name: str) -> PredictorPart:
-    """Return the predictor of this name, such as `kalman`."""
     predictors = PredictorPart.every()
     if name not in predictors:
         raise UnknownName("rectifier.predictor", name, [*predictors, DRAFT])
@@ -80,7 +75,7 @@ def find_predictor(name: str) -> PredictorPart:
 
 @dataclass
 class CompensateSettings:
-    """KERV: after a rejected draft token, predict the rest of the token's control step (see `Compensation`)."""
+    """KERV: after a rejected draft token, predict the rest of the token's control step."""
 
     kind: str = "compensate"
     # kalman, hold, linear (ours); walk (public code); draft: the rejected draft's remaining tokens (ours)
@@ -108,15 +103,8 @@ class CompensateSettings:
 class Compensation(Rectifier):
     """KERV: after a rejected draft token, keeps the tokens before it and predicts the rest of the control step.
 
-    The settings change what is kept and predicted:
-
-    - `use_target_token` (ours): also keep the target's token at the rejected position, which is already computed.
-    - `drop` (ours): end the chunk after the predicted steps. Otherwise the target decodes the later steps.
-    - `steps` (the paper's predict length PL): how many control steps to fill.
-    - `hold_strict` (ours): strict DoFs, such as the gripper, keep their last value. Otherwise they are predicted, too.
-    - `predictor=draft` (ours): fill with the remaining tokens of the rejected draft first. A draft was made from
-      the observation, a prediction only from past actions.
-    - `rest`: number of decodes after each compensation in which nothing is compensated.
+    `CompensateSettings` say what else is kept and predicted. With `predictor=draft` (ours) the remaining tokens of the
+    rejected draft fill first: a draft was made from the observation, a prediction only from past actions.
     """
 
     def __init__(self, settings: CompensateSettings, predictor: Predictor) -> None:
@@ -156,7 +144,7 @@ class Compensation(Rectifier):
 
 
 class RadiusRange:
-    """Base of settings with a smallest and a largest acceptance radius, in bins."""
+    """Settings with a smallest and a largest acceptance radius, in bins."""
 
     r_min: int
     r_max: int
@@ -195,7 +183,6 @@ class KinematicThresholdSettings(RadiusRange):
 
     @property
     def measure(self) -> str:
-        """Way to compute the variability K, one of `MEASURES` (`engine/record.py`)."""
         return f"{'sum' if self.total else 'mean'} of {self.over}"
 
     def needs(self) -> tuple[str, ...]:
@@ -276,8 +263,7 @@ for _kind in ("offset", "change", "quoted"):
 class Schedule(Threshold):
     """The acceptance radius falls with the number t of decodes in the episode. The robot's motion does not change it.
 
-    r(t) = r_min + (r_max − r_min) · exp(−(t / τ)^φ). The default settings are those of KERV's public code:
-    r(t) = 3 + 12 · exp(−(t / 20)³).
+    The default settings are those of KERV's public code: r(t) = 3 + 12 · exp(−(t / 20)³).
     """
 
     def __init__(self, settings: ScheduleThresholdSettings, context: Context) -> None:
@@ -303,5 +289,4 @@ def falling(low: float, high: float, x: float, phi: float) -> float:
 
 
 def nearest(r: float) -> int:
-    """Round a radius to whole bins, halves up."""
-    return math.floor(r + 0.5)
+    return math.floor(r + 0.5)  # halves up

@@ -1,8 +1,7 @@
 """Predict the next actions from the last actions: as a draft, and after a rejection (docs/methods.md §3.1).
 
-For a given noise and window length, every prediction is a fixed linear function of the last actions. Its weights are
-computed once, so a prediction is one small matrix multiplication. Actions are normalised to [-1, 1]. The unit of time
-is a control step.
+For a given noise and window length, every prediction is a fixed linear function of the last actions, whose weights are
+computed once. Actions are normalised to [-1, 1]. The unit of time is a control step.
 
 Shapes: D degrees of freedom of an action, m past actions, B histories of actions.
 """
@@ -73,10 +72,7 @@ def filter_state(ratio: float, window: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def kalman_weights(q: float, r: float, window: int, horizon: int) -> np.ndarray:
-    """Return the weights (horizon, window) of the past actions in a Kalman filter's predictions for one DoF.
-
-    The prediction h control steps ahead is the dot product of row h − 1 and the last `window` actions (oldest first).
-    """
+    """Return the weights (horizon, window) of the past actions, oldest first, in one DoF's predictions."""
     state, transition = filter_state(q / r, window)
     return np.stack([(np.linalg.matrix_power(transition, h) @ state)[0] for h in range(1, horizon + 1)])
 
@@ -120,7 +116,6 @@ class Predictor:
 
     def released(self) -> Self:
         """Return a copy that also predicts the strict DoFs, instead of holding them."""
-        """Return a copy of this predictor that also predicts the strict DoFs, instead of holding them."""
         if self.noise is not None and not all(self.noise.q):
             raise CheckpointError(
                 "the calibration's filters were not fitted to strict DoFs: run 'kerv calibrate complete=true'"
@@ -128,13 +123,10 @@ class Predictor:
         return type(self)(np.zeros(self.dofs, bool), self.noise, self.minimum, self.window, self.horizon)
 
     def predict(self, history: np.ndarray, steps: int) -> np.ndarray | None:
-        """Predict the next actions.
+        """Predict the next actions (steps, D) in [-1, 1], or None if the history has fewer than `minimum` actions.
 
         Args:
             history: (m, D) past actions, oldest first.
-
-        Returns:
-            (steps, D) in [-1, 1]. None if the history has fewer than `minimum` actions.
         """
         if len(history) < self.minimum:
             return None
@@ -177,9 +169,8 @@ class Kalman(Predictor):
 class Walk(Predictor):
     """The filter of KERV's public code: a random walk per DoF, on token ids, with Q = 1 and R = 1e-3.
 
-    It is a Kalman filter whose state is the action alone. Its gain is 0.999, so it nearly repeats the last action. The
-    filter starts at the first action, with the variance R. A token id is a normalised value times a scale plus an
-    offset. So the filter has the same weights for token ids and for normalised values.
+    Its gain is 0.999, so it nearly repeats the last action. The filter starts at the first action, with the variance R.
+    A token id is a normalised value times a scale plus an offset, so the weights are the same for both.
     """
 
     name = "walk"
