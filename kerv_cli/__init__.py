@@ -1,8 +1,4 @@
-"""kerv as a library: `import kerv_cli as kerv`.
-
-The names come from `kerv_cli.api`. That module is imported when one of the names is first used. `import kerv_cli`
-itself loads nothing.
-"""
+"""kerv as a library: `import kerv_cli as kerv`. It loads nothing until a name of `kerv_cli.api` is used."""
 
 from __future__ import annotations
 
@@ -13,7 +9,6 @@ __all__ = ["KervError", "Policy", "Study", "load_policy", "load_study", "rollout
 
 
 def __getattr__(name: str) -> Any:
-    """Return a name of the API."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module("kerv_cli.api"), name)

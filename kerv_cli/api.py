@@ -1,8 +1,7 @@
 """The commands as Python functions: `import kerv_cli as kerv`, then `kerv.rollout(method="one_pass", task="reach")`.
 
-The functions take the settings of the commands, as text (`"threshold.r=5"`) or as keyword arguments. For a setting with
-a dot in its name pass a mapping, `threshold={"r": 5}`. None means null. Nothing is printed. Errors are KervErrors with
-a message of one line.
+Settings are text (`"threshold.r=5"`) or keywords. A setting with a dot in its name is a mapping, `threshold={"r": 5}`.
+None means null. Nothing is printed. Errors are KervErrors with a message of one line.
 """
 
 from __future__ import annotations
@@ -41,22 +40,17 @@ TABLES = ("settings", "tasks", "episodes")
 
 @dataclass(frozen=True)
 class Study:
-    """The complete episodes of a sweep or a rollout. Each call of a method reads the episodes from the database again.
-
-    Attributes:
-        store: The study in the database.
-    """
+    """The complete episodes of a sweep or a rollout. Each call of a method reads them from the database again."""
 
     store: StoredStudy
 
     @property
     def name(self) -> str:
-        """Name of the study, by which `load_study` and the commands find it."""
+        """Name by which `load_study` and the commands find the study."""
         return self.store.name
 
     @property
     def folder(self) -> Path:
-        """Folder with the study's files: report and recordings."""
         return self.store.root
 
     def to_pandas(self, table: str = "settings") -> pd.DataFrame:
@@ -79,7 +73,7 @@ class Study:
         return pd.DataFrame([row.columns() for row in results])
 
     def episodes(self) -> list[Row]:
-        """Return the rows of the table `episodes` as dictionaries. It raises the same errors as `to_pandas`."""
+        """Return the rows of the table `episodes`, with the same errors as `to_pandas`."""
         rows: list[Any] = self.to_pandas("episodes").to_dict("records")
         return rows
 
@@ -119,20 +113,15 @@ def rollout(*overrides: str, grid: bool = False, **settings: object) -> Study:
 
 
 def sweep(study: str | Path, *overrides: str, **settings: object) -> Study:
-    """Run the missing episodes of a study, as `kerv sweep` does.
-
-    A study compares several settings. Each setting runs on every task with the same seeds. The settings take turns.
+    """Run the missing episodes of a study, as `kerv sweep` does: each setting on every task, with the same seeds.
 
     Args:
         study: Name of a file in conf/study, or the path of such a file.
         *overrides: Settings as text, such as `"episodes=5"`. They apply to each of the study's settings.
-        **settings: Settings as keywords. They, too, apply to each of the study's settings.
+        **settings: The same as keywords.
 
     Raises:
-        UsageError: A setting or a policy does not exist, or a value is impossible.
-        CheckpointError: A policy is damaged, or an artifact that a method needs is missing or damaged.
-        Interrupted: The user pressed Ctrl-C. Complete episodes are kept.
-        KervError: Some episodes failed. All complete episodes are kept.
+        KervError: Some episodes failed. All complete episodes are kept. Other errors are those of `rollout`.
     """
     with chosen_store(as_overrides(f"study={study}", *overrides, **settings)) as typed:
         resolved = resolve(typed)
@@ -152,8 +141,8 @@ def load_study(name: str, results: str | Path = "results", store: str = "") -> S
     Args:
         name: The study's name or a unique part of the name, `last` for the newest, or the path of a study's file.
         results: Folder that kerv writes to.
-        store: URL of the database. If empty, the environment variable KERV_STORE gives the URL. If that is empty, too,
-            the database is an SQLite file in `results`.
+        store: URL of the database. By default that of the environment variable KERV_STORE, or else an SQLite file in
+            `results`.
 
     Raises:
         UsageError: Nothing matches the name, several entries match, or the match is no sweep or rollout.
@@ -164,7 +153,7 @@ def load_study(name: str, results: str | Path = "results", store: str = "") -> S
 
 
 def runs(results: str | Path = "results", store: str = "", **filters: str) -> pd.DataFrame:
-    """Return a table of all runs, as `kerv runs list` shows it: sweeps, rollouts, trainings, …, the newest first.
+    """Return a table of all runs, the newest first, as `kerv runs list` shows it.
 
     Args:
         results: Folder that kerv writes to.
@@ -181,9 +170,7 @@ def runs(results: str | Path = "results", store: str = "", **filters: str) -> pd
 
 
 class Policy:
-    """A policy that decodes with one method, in this process. `load_policy` makes it.
-
-    It gives the same answers as `kerv serve` (docs/serving.md).
+    """A policy that decodes with one method, in this process, with the same answers as `kerv serve` (docs/serving.md).
 
     Attributes:
         info: Description of inputs and outputs: cameras, image_size (pixels), names of the numbers in the state, names
@@ -236,7 +223,7 @@ def load_policy(
         *overrides: Settings of `kerv serve` as text, such as `"threshold.r=5"`.
         method: Name of a file in conf/method, or the path of such a file.
         task: Name of the task. Needed only by methods with calibrated constants per task, such as KERV.
-        **settings: Settings of `kerv serve` as keywords, such as `gripper="signed"`.
+        **settings: The same as keywords, such as `gripper="signed"`.
 
     Raises:
         UsageError: A setting or the policy does not exist, or a value is impossible.

@@ -32,10 +32,10 @@ from kerv_cli.lab.database import Database
 HOST = "127.0.0.1"
 _HOSTS = [HOST, "localhost"]
 _READS = ("GET", "HEAD")
+# Seconds between two checks of a connection. One without a request since the last check is closed.
 PATIENCE = 5.0
-"""Seconds between two checks of a connection. A connection without a request since the last check is closed."""
+# Seconds for which a stopping board waits for answers that are being computed
 LAST_ANSWERS = 1.0
-"""Seconds for which a stopping board waits for answers that are being computed."""
 
 
 class SameOrigin:
@@ -48,7 +48,6 @@ class SameOrigin:
         self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer 403, or pass the request on."""
         if scope["type"] == "http" and scope["method"] not in _READS:
             headers = Request(scope).headers
             if urlsplit(headers.get("origin", f"http://{headers['host']}")).netloc != headers["host"]:
@@ -61,16 +60,11 @@ class Impatient(H11Protocol):
     """A connection that is closed if it sends no complete request for PATIENCE seconds."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to serve a connection, and to check it every PATIENCE seconds."""
         super().connection_made(transport)
         self.loop.call_later(PATIENCE, self._check, None)
 
     def _check(self, before: object) -> None:
-        """Close the connection if it waits for a request and has sent none since the last check.
-
-        Args:
-            before: The newest request at the last check. None if there was no request yet.
-        """
+        """Close the connection if it waits for a request and has sent none since `before`, its newest."""
         waits = self.cycle is None or self.cycle.response_complete
         if waits and self.cycle is before:
             self.transport.close()
@@ -79,10 +73,7 @@ class Impatient(H11Protocol):
 
 
 def make_app(database: Database) -> Starlette:
-    """Return the web app that shows a database and its results folder.
-
-    Pages find the database in `request.app.state.database`.
-    """
+    """Return the web app of a database and its results folder. Pages find it in `request.app.state.database`."""
     folders = {"/static": ("kerv_cli.board", "static"), "/report": ("kerv_cli.report", "templates")}
     files = [Mount(path, StaticFiles(packages=[folder])) for path, folder in folders.items()]
     app = Starlette(
@@ -105,12 +96,6 @@ def failed(request: Request, error: Exception) -> Response:
 
 
 def web_server(database: Database, **options: Any) -> uvicorn.Server:
-    """Return the server of the web app.
-
-    Args:
-        database: The database to show.
-        **options: More options of uvicorn.
-    """
     return uvicorn.Server(uvicorn.Config(make_app(database), http=Impatient, log_level="critical", **options))
 
 
@@ -118,10 +103,8 @@ def serve(database: Database, port: int, opened: Callable[[str], None], browser:
     """Serve the web app until Ctrl-C.
 
     Args:
-        database: The database to show.
-        port: Port to listen on. If 0, a free port is used.
+        port: If 0, a free port is used.
         opened: Called with the address as soon as the port is open.
-        browser: Whether to open the address in the browser.
     """
     server = web_server(database)
     with socket.socket() as listening:

@@ -33,8 +33,8 @@ from kerv_cli.report.tables import dof_names
 from kerv_cli.report.viewing.token_outcomes import OUTCOMES, chunk_size, outcomes_of, token_names, tokens_hash
 from kerv_cli.report.viewing.viewer import Film, animation, film_of, viewer_command
 
+# Factor by which a film plays slower than the robot moves
 SLOWER = 2
-"""Factor by which a film plays slower than the robot moves."""
 
 
 def _found(request: Request) -> FoundEpisode:
@@ -46,11 +46,7 @@ def _film(request: Request) -> Film:
 
 
 def command_of(found: FoundEpisode) -> tuple[str, str]:
-    """Return the command that repeats an episode, or the reason why there is none.
-
-    Returns:
-        (command, reason). One of them is empty.
-    """
+    """Return (command, reason): the command that repeats an episode, or why there is none. The other is empty."""
     from kerv_cli.episodes.resolve import repeating_words
 
     episode, results = found.episode, str(found.store.database.results)
@@ -95,14 +91,6 @@ def show_episode(request: Request) -> Response:
 def _film_values(
     request: Request, found: FoundEpisode, step: int = 0, decodes: Sequence[DecodeRecord] | None = None
 ) -> dict[str, Any]:
-    """Return the values that the template of a film shows.
-
-    Args:
-        request: The request.
-        found: The episode.
-        step: Control step to show first.
-        decodes: Decodes of the episode. If None, they are read when they are needed.
-    """
     job = RECORDER.job(found.recording)
     values: dict[str, Any] = {"found": found, "step": step, "job": job, "film": None, "same": None, "rerun": ""}
     values |= {"slower": SLOWER, "missing": "" if has_rerun() else NO_RERUN}
@@ -116,12 +104,11 @@ def _film_values(
 
 
 def show_film(request: Request) -> Response:
-    """Show an episode's film, or the button that records it. During the recording, show the seconds since the click."""
+    """Show an episode's film, or the button that records it, or how long it has been recorded."""
     return render(request, "episode_film.html", **_film_values(request, _found(request)))
 
 
 def record(request: Request) -> Response:
-    """Start to record an episode, unless it is being recorded already."""
     RECORDER.record(_found(request))
     return show_film(request)
 
@@ -138,7 +125,6 @@ def frame(request: Request) -> Response:
 
 
 def animated(request: Request) -> Response:
-    """Return the film as a GIF, to show elsewhere."""
     film = _film(request)
     if not film.frames:
         raise HTTPException(404, "the recording has no camera")
@@ -146,27 +132,25 @@ def animated(request: Request) -> Response:
 
 
 def recording(request: Request) -> Response:
-    """Return the recording, a file for Rerun's viewer."""
     path = inside(request, _found(request).recording)
     return FileResponse(path, media_type="application/octet-stream", filename=path.name)
 
 
 _VIEWER_FILES = ("", "re_viewer.js", "re_viewer_bg.wasm", "favicon.ico")
 _VIEWER_SECONDS = 20.0
+# Content security policy of Rerun's viewer: a WebAssembly program with a script in its page
 _VIEWER_CONTENT = (
     "default-src 'none'; script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; font-src 'self' data:; connect-src 'self' data: blob:; worker-src 'self' blob:; "
     "base-uri 'none'; frame-ancestors 'none'"
 )
-"""Content security policy of Rerun's viewer: a WebAssembly program with a script in its page."""
 
 
 @functools.cache
 def viewer_files() -> dict[str, tuple[bytes, str]]:
     """Return content and media type of each file of Rerun's web viewer, by the file's name.
 
-    Rerun's package offers these files only through its own web server. The server is started for a moment, and only
-    this machine can reach it.
+    Rerun's package offers them only through its own web server, which is started for a moment, for this machine alone.
     """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -182,7 +166,6 @@ def viewer_files() -> dict[str, tuple[bytes, str]]:
 
 
 def _fetched(address: str) -> tuple[bytes, str]:
-    """Wait until a server has started. Return content and media type of the file at an address."""
     end = time.monotonic() + _VIEWER_SECONDS
     while True:
         try:
@@ -199,7 +182,6 @@ def _fetched(address: str) -> tuple[bytes, str]:
 
 
 def viewer(request: Request) -> Response:
-    """Return a file of Rerun's web viewer."""
     name = request.path_params["name"]
     if name not in _VIEWER_FILES:
         raise HTTPException(404, "Rerun's viewer has no such file")

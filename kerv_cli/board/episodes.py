@@ -22,6 +22,7 @@ from kerv_cli.report.measures import NEAR
 from kerv_cli.report.tables import references_of
 
 SUCCESS, FAILURE, LOST, WON, ERROR, MISSING = "success", "failure", "lost", "won", "error", "missing"
+# Kind of outcome -> its symbol and its meaning, in the order of the page's legend
 OUTCOMES = {
     LOST: ("▼", "only the baseline solved it"),
     FAILURE: ("×", ""),
@@ -30,13 +31,13 @@ OUTCOMES = {
     ERROR: ("!", "could not run"),
     MISSING: ("·", "not run yet"),
 }
-"""Maps each kind of outcome to its symbol and its meaning, in the order of the page's legend."""
 FAILURES = (LOST, FAILURE)
 
+# Episodes that the page lists for each group of failures
 MOST_SHOWN = 24
-"""Largest number of episodes that the page lists for each group of failures."""
+# Metres. If the object moved at least this far, a failure counts as after contact.
 MOVED = 0.01
-"""Distance in metres. If the object moved at least this far, a failure counts as after contact."""
+# Phase of a task in which an episode can fail -> what it means
 PHASES = {
     "before contact": "the fingertips never came within 2 cm of the object, and did not move it",
     "near contact": "they came within 2 cm, and the object moved less than 1 cm",
@@ -44,7 +45,6 @@ PHASES = {
     "near or after contact": "they came within 2 cm; an older kerv did not store how far the object moved",
     "unknown": "the task has no object, or the distance was not stored",
 }
-"""Maps each phase of a task in which an episode can fail to what the phase means."""
 
 
 def phase_of(closest: float | None, moved: float | None) -> str:
@@ -68,12 +68,9 @@ class Cell:
     """One episode of a study.
 
     Attributes:
-        label: Label of the episode's setting.
-        task: Name of the episode's task.
-        seed: Seed of the episode.
         episode: Row number of the episode in the database. None if the episode has not run.
         kind: Outcome of the episode, a key of OUTCOMES.
-        phase: How far the robot got (see `phase_of`), a key of PHASES. The page shows it only for failures.
+        phase: How far the robot got, a key of PHASES. The page shows it only for failures.
         stress: Kind and level of the episode's stress, such as `push 2`. Empty without stress.
     """
 
@@ -91,10 +88,8 @@ class Grid:
     """The episodes of one task, as a table with one row per setting and one column per seed.
 
     Attributes:
-        task: Name of the task.
-        seeds: All seeds. The seeds with the most failures come first.
+        seeds: The seeds with the most failures come first.
         rows: The episodes of each setting, by the setting's label and then by seed.
-        failed: Number of failed episodes.
         total: Number of all episodes, also those that have not run.
     """
 
@@ -106,13 +101,7 @@ class Grid:
 
 
 def cells_of(rows: Sequence[Any], baseline: str, settings: Mapping[str, Setting]) -> list[Cell]:
-    """Return a cell for every episode. Its kind compares the episode's outcome with the baseline's outcome.
-
-    Args:
-        rows: Rows of the result of `outcomes`, one per episode.
-        baseline: Label of the baseline.
-        settings: The settings by label.
-    """
+    """Return a cell for every row of `outcomes`. Its kind compares the outcome with the baseline's."""
     references = references_of(list(settings.values()), baseline)
     names = {}
     for label, one in settings.items():
@@ -128,12 +117,6 @@ def cells_of(rows: Sequence[Any], baseline: str, settings: Mapping[str, Setting]
 
 
 def _kind(row: Any, baseline: bool | None) -> str:
-    """Classify an episode's outcome: success, failure, won or lost (against the baseline), error or missing.
-
-    Args:
-        row: The episode, a row of the result of `outcomes`.
-        baseline: Whether the baseline solved the same task and seed. None if the baseline has no result.
-    """
     if row.episode is None:
         return ERROR if row.failed else MISSING
     if row.success:
@@ -161,8 +144,7 @@ def grids_of(cells: Sequence[Cell]) -> list[Grid]:
 def clusters_of(cells: Sequence[Cell]) -> list[tuple[list[Cell], int]]:
     """Group failures by task, setting and phase, the largest group first.
 
-    Returns:
-        Pairs of a group of failures, and the number of all episodes of the same task and setting that have run.
+    Each comes with the number of all episodes of its task and setting that have run.
     """
     groups: dict[tuple[str, ...], list[Cell]] = defaultdict(list)
     ran: Counter[tuple[str, str]] = Counter()
@@ -174,13 +156,7 @@ def clusters_of(cells: Sequence[Cell]) -> list[tuple[list[Cell], int]]:
 
 
 def _asked(request: Request) -> tuple[list[Cell], dict[str, Any]]:
-    """Read the episodes of a study for one of its pages: all episodes, or the failures.
-
-    Returns:
-        cells: All episodes, or only the episodes of the setting and task that the address names.
-        values: Values for the templates of both pages: `study`, `baseline`, `known` (all settings and tasks) and
-            `chosen` (the setting and task that the address names).
-    """
+    """Return the study's episodes, of the setting and task that the address names, and values for the templates."""
     store = Study(database_of(request), request.path_params["name"])
     study = store.load()
     baseline, settings = study.baseline, {one.label: one for one in study.settings}
@@ -195,14 +171,12 @@ def _asked(request: Request) -> tuple[list[Cell], dict[str, Any]]:
 
 
 def show_episodes(request: Request) -> Response:
-    """Show all episodes of a study as a grid."""
     cells, asked = _asked(request)
     counts = Counter(map(attrgetter("kind"), cells))
     return render(request, "episodes.html", grids=grids_of(cells), counts=counts, outcomes=OUTCOMES, **asked)
 
 
 def show_failures(request: Request) -> Response:
-    """Show the failures of a study in groups."""
     cells, asked = _asked(request)
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     for cell in cells:

@@ -1,8 +1,6 @@
 """Write the board's pages as files that a browser opens without a server, and that can be sent to a colleague.
 
-The web app renders the pages. This module calls the app directly, without a server or a network. Links lead to the
-written files. A link to a page that is not exported becomes plain text. The templates leave out what works only with
-a server, such as forms and buttons.
+The web app is called directly. Links lead to the written files. A link to a page that is not exported becomes text.
 """
 
 from __future__ import annotations
@@ -24,10 +22,10 @@ from kerv_cli.base.errors import KervError
 from kerv_cli.board.app import make_app
 from kerv_cli.lab.database import Database
 
+# Episodes that get a page
 MOST_EPISODES = 400
-"""Largest number of episodes that get a page."""
+# Once the exported films have this many bytes in all, further films are left out.
 MOST_FILM_BYTES = 8_000_000
-"""Once the exported films have this many bytes in all, further films are left out."""
 
 
 def export_board(
@@ -36,12 +34,10 @@ def export_board(
     folder: Path,
     advance: Callable[[int, int, str], None],
 ) -> list[Path]:
-    """Write the pages of a board into a folder, and return the paths of the files, `index.html` first.
+    """Write the pages of a board into an empty folder, and return the paths of the files, `index.html` first.
 
     Args:
-        database: The database.
         names: Ids of the runs to export. If empty, all runs are exported.
-        folder: An empty folder.
         advance: Called before each page, with the number of finished pages, the number of all pages that are known so
             far, and the page's address.
     """
@@ -91,9 +87,9 @@ def _asked(app: Starlette, address: str) -> tuple[int, str, bytes]:
 
 
 def _collected(app: Starlette, advance: Callable[[int, int, str], None]) -> dict[str, str | bytes]:
-    """Ask for the first page and for all pages and files that it leads to. Return the answers by address.
+    """Return the first page and all pages and files that it leads to, by address. Failed answers are left out.
 
-    Failed answers are left out. Parts that a browser loads later (`hx-trigger="load"`) are put into their page.
+    Parts that a browser loads later (`hx-trigger="load"`) are put into their page.
     """
     pages: dict[str, str | bytes] = {}
     waiting, films, episodes = ["/"], 0, 0
@@ -135,10 +131,6 @@ def _filled(app: Starlette, address: str, text: str) -> str:
 
 
 def _plain(address: str, link: str) -> str:
-    """Return the address that a link on a page leads to, without query.
-
-    For a frame of a film, return the address of the whole film.
-    """
     path = urlsplit(urljoin(address, link)).path
     return re.sub(r"^(/episodes/\d+)/frames/\d+$", r"\1/film.gif", path)
 
@@ -149,13 +141,7 @@ def _links(address: str, text: str) -> list[str]:
 
 
 def _as_file(address: str, text: str, pages: Collection[str]) -> str:
-    """Rewrite a page of the board so that it works as a file, without the board.
-
-    Args:
-        address: The page's address.
-        text: The page.
-        pages: Addresses of all exported pages and files.
-    """
+    """Rewrite a page of the board so that it works as a file, beside the exported `pages`."""
     folder = Path(file_of(address)).parent
 
     def target(link: str) -> str:

@@ -28,24 +28,18 @@ TEMPLATES = Environment(
 )
 
 CONTENT_POLICY = "content-security-policy"
-"""HTTP header that says what a page may load and run."""
+# The board's pages load only the board's files, and no inline script or style.
 _OWN_CONTENT = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
     "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
-"""Content security policy of the board's pages. They load only the board's files, and no inline script or style."""
 
 
 def page_of(run: str) -> str:
-    """Return the address of the page of an artifact or study, given its id.
-
-    An id with a slash, such as `target/mine`, belongs to an artifact. Any other id belongs to a study.
-    """
     return f"/artifacts/{quote(run)}" if "/" in run else f"/studies/{quote(run)}"
 
 
 def figure(value: float) -> str:
-    """Return a number with four significant digits, or `–` if it is missing or NaN."""
     return f"{value:.4g}" if is_number(value) else "–"
 
 
@@ -53,7 +47,6 @@ TEMPLATES.filters |= {"few": few, "page_of": page_of, "figure": figure, "code": 
 
 
 def database_of(request: Request) -> Database:
-    """Return the database of the results folder that the app shows."""
     database: Database = request.app.state.database
     return database
 
@@ -61,8 +54,8 @@ def database_of(request: Request) -> Database:
 def refreshed(page: Callable[[Request, str, bool], Response]) -> Callable[[Request], Response]:
     """Decorate a function that makes a page which the browser asks for again and again.
 
-    The function is called only if the database has changed since the browser last asked. Its further arguments are the
-    version of the database, and whether any command is running.
+    It is called only if the database has changed since, with the database's version, and whether any command is
+    running.
     """
 
     @functools.wraps(page)
@@ -76,15 +69,7 @@ def refreshed(page: Callable[[Request, str, bool], Response]) -> Callable[[Reque
 
 
 def render(request: Request, template: str, status: int = 200, **values: Any) -> HTMLResponse:
-    """Return a page.
-
-    Args:
-        request: The request. Templates can read it, for example `request.url.path`. `request.app.state.live` says
-            whether to show what works only with the server, such as forms.
-        template: File in `templates/`.
-        status: HTTP status.
-        **values: Values that the template shows. They are escaped.
-    """
+    """Return a page from a file in `templates/`. The values are escaped."""
     text = TEMPLATES.get_template(template).render(request=request, live=request.app.state.live, **values)
     return HTMLResponse(text, status, {CONTENT_POLICY: _OWN_CONTENT})
 

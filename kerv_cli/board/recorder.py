@@ -26,7 +26,7 @@ class Job:
 
     Attributes:
         future: Its result is the error as text, or an empty text if the recording was written.
-        asked: Time at which the user asked for it, seconds since 1970.
+        asked: Seconds since 1970.
     """
 
     future: Future[str]
@@ -34,12 +34,10 @@ class Job:
 
     @property
     def seconds(self) -> int:
-        """Seconds since the user asked for the recording."""
         return int(time.time() - self.asked)
 
     @property
     def error(self) -> str:
-        """Why the recording failed. Empty if it succeeded or still runs."""
         return self.future.result() if self.future.done() else ""
 
 
@@ -52,11 +50,9 @@ class Recorder:
         self._process: subprocess.Popen[str] | None = None
 
     def job(self, path: Path) -> Job | None:
-        """Return the newest job that writes this file. None if nobody asked for such a job."""
         return self._jobs.get(path)
 
     def record(self, found: FoundEpisode) -> None:
-        """Start to record an episode, unless it is being recorded already."""
         job = self._jobs.get(found.recording)
         if job is None or job.future.done():
             self._jobs[found.recording] = Job(self._pool.submit(self._run, found), time.time())

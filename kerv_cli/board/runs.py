@@ -25,12 +25,13 @@ from kerv_cli.lab.store import Study
 from kerv_cli.report.compare import compare, pairs_to_compare
 from kerv_cli.report.tables import flatten
 
+# Choice of the filter by state -> whether a run is shown
 STATES: dict[str, Callable[[RunEntry], bool]] = {
     "running": lambda run: run.is_running,
     "complete": lambda run: run.state == "complete",
     "unfinished": lambda run: run.state != "complete" and not run.is_running,
 }
-"""For each choice of the filter by state, the function that says whether a run is shown."""
+# Columns by which the table can be sorted -> the sort key of a run. A minus before the name reverses the order.
 ORDERS: dict[str, Callable[[RunEntry], object]] = {
     "run": lambda run: run.id,
     "state": lambda run: (not run.is_running, run.state == "complete", run.state),
@@ -39,11 +40,10 @@ ORDERS: dict[str, Callable[[RunEntry], object]] = {
     "methods": lambda run: run.methods,
     "tasks": lambda run: run.tasks,
 }
-"""Columns by which the table can be sorted, with the sort key of a run. A minus before the name reverses the order."""
+# Share of all cores' time for refreshing a running study's page, so that measured times are not disturbed
 _SHARE = 0.01
-"""Largest share of all cores' time for refreshing a running study's page, so that measured times are not disturbed."""
+# Shortest time between two refreshes of a study's tables
 _SECONDS = 5.0
-"""Shortest time between two refreshes of a study's tables, in seconds."""
 
 
 @refreshed
@@ -97,12 +97,7 @@ def show_comparison(request: Request) -> Response:
 def _parts(database: Database, name: str, version: str, is_running: bool) -> tuple[dict[str, Any], float]:
     """Return the values of a study's report, and the seconds to wait before the next refresh.
 
-    Args:
-        database: The database.
-        name: Name of the study.
-        version: `Study.version` of the study. A study is read again only if its version has changed.
-        is_running: Whether the study is running. If so, the report has no speeds from a cost model, because computing
-            them would slow the study down.
+    A running study's report has no speeds from a cost model, because computing them would slow the study down.
     """
     from kerv_cli.report.report import Report, study_parts  # imports Altair, which takes a second
     from kerv_cli.report.reprice import own_profiles, repriced
@@ -140,7 +135,6 @@ def show_study(request: Request, version: str, is_live: bool) -> Response:
 
 
 def show_tables(request: Request) -> Response:
-    """Show the report of a study: its verdict, tables and charts."""
     database, name = database_of(request), request.path_params["name"]
     store = Study(database, name)
     is_running = RUNNING in map(attrgetter("status"), run_rows(database, store.kind, name))
@@ -165,7 +159,6 @@ def show_tables(request: Request) -> Response:
 
 
 def send_library(request: Request) -> Response:
-    """Send the JavaScript library that draws charts."""
     from kerv_cli.report.plots import library
 
     return Response(library(), media_type="text/javascript", headers={"cache-control": "max-age=86400"})
@@ -173,7 +166,6 @@ def send_library(request: Request) -> Response:
 
 @refreshed
 def show_artifact(request: Request, version: str, is_live: bool) -> Response:
-    """Show one artifact, and its curves while it is trained."""
     database = database_of(request)
     runs = find_runs(database)
     run = find_run(database, request.path_params["name"], exact=True)

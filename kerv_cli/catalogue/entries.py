@@ -35,21 +35,19 @@ from kerv_cli.lab.store import ROLLOUT, SWEEP, Study
 if TYPE_CHECKING:
     from kerv_cli.lab.study import Plan
 
-LOG, WEIGHTS = "log.csv", "model.safetensors"
-"""Names of the files that a training writes: the log of its validations, and the weights."""
+LOG, WEIGHTS = "log.csv", "model.safetensors"  # files of a training
+# Argument of commands that stands for the newest entry
 LAST = "last"
-"""Argument of commands that stands for the newest entry."""
 _STUDIES = (SWEEP, ROLLOUT)
 _STATES = ("complete", "begun", "damaged", "step ", "running", "interrupted", "failed")
+# Labels that people give to a run: words, separated by commas, and free text
 LABELS = ("tag", "note")
-"""Kinds of labels that people give to a run. `tag` is a list of words, separated by commas. `note` is free text."""
+# In the table `about`, the row with the key `labels of ID` holds the labels of the run ID.
 _ABOUT = "labels of "
-"""Beginning of keys in the table `about`. The row with the key `labels of ID` holds the labels of the run ID."""
 _FILTERS = ("kind", "method", "task", "state", "since", "tag")
 
 
 def artifact_kinds() -> tuple[str, ...]:
-    """Return the kinds of artifacts (weights and data), including those that plugins add."""
     return ("demos", "target", *ArtifactPart.every())
 
 
@@ -60,23 +58,19 @@ class RunEntry:
     Attributes:
         id: Name by which commands find the entry.
         kind: sweep, rollout, or a kind of artifact.
-        folder: Folder of the entry's files.
-        started: Start time in UTC (ISO 8601). For an artifact, the time when its newest file changed.
+        started: UTC (ISO 8601). For an artifact, the time when its newest file changed.
         state: For example `complete`, `interrupted, 2 of 6 episodes`, `step 300 of 600`, `begun` or `damaged`.
         methods: Decoding methods of the study's settings. For an artifact, only its kind.
-        tasks: Names of the entry's tasks.
-        episodes: Number of stored episodes.
         total: Number of episodes or training steps that were planned. 0 if unknown.
-        done: Number of planned episodes or training steps that are finished.
+        done: Number of these that are finished.
         left: Estimated remaining time, such as `about 3 min left`. Empty if unknown, or if the entry is not running.
-        message: Error message of the newest command that makes the entry. Empty if that command had no error.
+        message: Error message of the newest command that makes the entry.
         figures: Main results of the entry by name, such as the success rate.
         command: Command-line arguments (without `kerv`) that made the entry. Empty if unknown.
         sha256: Hash by which other entries refer to this artifact.
-        made_from: Hashes of the artifacts that the entry was made from. The key is the artifact's kind, such as
-            `drafter`. If the settings of a study use several artifacts of one kind, the first has the kind as key. The
-            others have the label of their setting in the key, too: `drafter of LABEL`. The key `init` stands for the
-            target whose weights a training started from.
+        made_from: Hashes of the artifacts that the entry was made from, by kind. If the settings of a study use several
+            of one kind, the keys of the others are `drafter of LABEL`. `init`: the target whose weights a training
+            started from.
         labels: Texts that people wrote about the entry, with the keys `tag` and `note`.
     """
 
@@ -100,27 +94,22 @@ class RunEntry:
 
     @property
     def tags(self) -> list[str]:
-        """The words of the entry's label `tag`."""
         return list(filter(None, self.labels.get("tag", "").split(",")))
 
     @property
     def command_line(self) -> str:
-        """The shell command that made the study or artifact. Empty if unknown."""
         return shlex.join(["kerv", *self.command]) if self.command else ""
 
     @property
     def has_episodes(self) -> bool:
-        """Whether the entry is a study: a sweep or a rollout."""
         return self.kind in _STUDIES
 
     @property
     def is_running(self) -> bool:
-        """Whether a process is now making the study or artifact."""
         return self.state.startswith(RUNNING)
 
 
 def few(names: Sequence[str], most: int = 3) -> str:
-    """Return the first names, and how many more there are: `ar, kerv, jacobi +4`."""
     return ", ".join(names[:most]) + (f" +{len(names) - most}" if len(names) > most else "")
 
 
@@ -159,8 +148,6 @@ def _with_command(entry: RunEntry, row: RunRow, is_finished: bool) -> RunEntry:
     """Return an entry with the state, progress and message of the newest command that makes it.
 
     Args:
-        entry: The entry, as its rows and files describe it.
-        row: The command.
         is_finished: Whether the same command has finished before. Then a failed repetition keeps the artifact complete.
     """
     entry, is_running = replace(entry, command=row.command), row.status == RUNNING
@@ -178,11 +165,9 @@ def _with_command(entry: RunEntry, row: RunRow, is_finished: bool) -> RunEntry:
 
 
 def find_run(database: Database, name: str, exact: bool = False) -> RunEntry:
-    """Return one entry of a database and its results folder.
+    """Return one entry: by its id, a part that no other id contains, or `last` for the newest.
 
     Args:
-        database: The database.
-        name: Id of the entry, a part of it that no other id contains, or `last` for the newest entry.
         exact: Whether to accept only a whole id.
     """
     runs = find_runs(database)
@@ -207,10 +192,8 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
     """Return the entries that match every filter.
 
     Args:
-        runs: Entries to choose from.
-        filters: The value of each filter, by the filter's name. `kind` is the exact kind. `method`, `task` and `tag`
-            are names, or patterns such as `drawer*`. `state` is the beginning of a state, and `since` the earliest
-            start time (ISO 8601).
+        filters: `kind` is the exact kind. `method`, `task` and `tag` are names, or patterns such as `drawer*`. `state`
+            is the beginning of a state, and `since` the earliest start time (ISO 8601).
     """
     for key in filters:
         if key not in _FILTERS:
@@ -238,19 +221,12 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
 
 
 def store_of(run: RunEntry, database: Database) -> Study:
-    """Return the stored study (settings and episodes) of an entry.
-
-    Args:
-        run: The entry.
-        database: The database that `find_run` found it in.
-    """
     if not run.has_episodes:
         raise UsageError(f"{run.id} is a {run.kind}: it has no episodes")
     return Study(database, run.folder.name, run.kind)
 
 
 def _studies(database: Database) -> Iterator[RunEntry]:
-    """Yield an entry for each study of a database."""
     every = WANTED.join(SETTINGS).outerjoin(EPISODES, EPISODES.c.id == WANTED.c.episode_id)
     group = SETTINGS.c.study_id, WANTED.c.task
     sums = sa.select(
@@ -296,10 +272,7 @@ def _studies(database: Database) -> Iterator[RunEntry]:
 
 
 def description_of(run: RunEntry) -> dict[str, Any]:
-    """Return the provenance of an artifact: the command, settings and data that made it.
-
-    Empty if the provenance is unknown, and for a training that has not reached its first validation.
-    """
+    """Return the provenance of an artifact: the command, settings and data that made it. Empty if unknown."""
     return dict(_described(run.folder, run.kind).get("provenance") or {})
 
 
@@ -360,8 +333,7 @@ def _made_from(value: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[
 def parents(run: RunEntry, runs: Sequence[RunEntry]) -> dict[str, str]:
     """Return the names of the artifacts that an entry was made from, by kind.
 
-    The name is the id of another entry, or `shipped` and the name of a policy that kerv ships. For any other artifact,
-    the name is the first 12 digits of its hash.
+    A name is the id of another entry, `shipped` and the name of a policy, or the first 12 digits of a hash.
     """
     names = {other.sha256: other.id for other in runs}
     for folder in visible(shipped_dir()):
@@ -372,12 +344,10 @@ def parents(run: RunEntry, runs: Sequence[RunEntry]) -> dict[str, str]:
 
 
 def children(run: RunEntry, runs: Sequence[RunEntry]) -> list[RunEntry]:
-    """Return the entries that were made from an artifact: trainings, datasets and studies."""
     return [other for other in runs if run.sha256 and run.sha256 in other.made_from.values()]
 
 
 def disk_bytes(folder: Path) -> int:
-    """Return the total size of all files in a folder, in bytes."""
     return sum(map(os.path.getsize, filter(Path.is_file, folder.rglob("*"))))
 
 
@@ -389,7 +359,6 @@ def labels_in(database: Database) -> dict[str, dict[str, str]]:
 
 
 def set_labels(database: Database, run: str, labels: Mapping[str, str]) -> None:
-    """Replace the labels of a run, given its id. Empty labels are removed."""
     kept = dict(filter(itemgetter(1), labels.items()))
     with database.writing() as connection:
         connection.execute(sa.delete(ABOUT).where(ABOUT.c.key == _ABOUT + run))
@@ -399,7 +368,6 @@ def set_labels(database: Database, run: str, labels: Mapping[str, str]) -> None:
 
 
 def check_removable(run: RunEntry) -> None:
-    """Refuse to remove an entry that is in use."""
     if run.folder.is_symlink():
         raise UsageError(f"{run.folder} is a link to {os.readlink(run.folder)}: remove the link, or what it points to")
     if run.is_running:
@@ -409,12 +377,8 @@ def check_removable(run: RunEntry) -> None:
 def remove(run: RunEntry, database: Database) -> None:
     """Remove an entry: its folder and its rows in the database.
 
-    The folder is renamed first, to a temporary name that every command ignores and that a later command deletes. If
-    this process is killed before the rows are deleted, the entry is still listed and can be removed again.
-
-    Args:
-        run: The entry to remove.
-        database: The database that has the entry's rows.
+    The folder is first renamed to a temporary name, which a later command deletes. If this process is killed before the
+    rows are deleted, the entry is still listed and can be removed again.
     """
     gone = set_aside(run.folder)
     if run.has_episodes:
@@ -425,14 +389,7 @@ def remove(run: RunEntry, database: Database) -> None:
 
 
 def plan_of(run: RunEntry, database: Database) -> Plan:
-    """Return a study that runs a sweep or rollout again.
-
-    If an earlier repetition was interrupted, the study consists of the rest of that repetition.
-
-    Args:
-        run: The sweep or rollout to repeat.
-        database: The database that has the sweep or rollout.
-    """
+    """Plan to run a sweep or rollout again, or the rest of an interrupted repetition."""
     from kerv_cli.lab.study import new_name, plan_study  # imports torch, which listing runs does not need
     from kerv_cli.lab.work import checked
 

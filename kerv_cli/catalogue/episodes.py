@@ -16,20 +16,13 @@ from kerv_cli.lab.plan import Episode
 from kerv_cli.lab.store import Study, setting_of
 
 LARGEST_ID = 2**31 - 1
-"""Largest row number that PostgreSQL stores."""
 
 
 def outcomes(store: Study, task: str = "", seed: int | None = None) -> list[Any]:
     """Return one row for every label, task and seed of a study, in the study's order.
 
-    Args:
-        store: The study.
-        task: Task of the episodes. If empty, episodes of all tasks are returned.
-        seed: Seed of the episodes. If None, episodes of all seeds are returned.
-
-    Returns:
-        Rows with the columns `label`, `task`, `seed`, `episode` (row number; None if the episode has not run),
-        `success`, `closest_approach`, `object_moved`, `failed` (whether the last attempt to run it raised an error).
+    The columns are `label`, `task`, `seed`, `episode` (row number; None if the episode has not run), `success`,
+    `closest_approach`, `object_moved`, `failed` (whether the last attempt to run it raised an error).
     """
     with store.database.reading() as connection:
         measures = {one.name: one for one in measures_in(connection)}
@@ -49,11 +42,7 @@ def outcomes(store: Study, task: str = "", seed: int | None = None) -> list[Any]
 
 
 def totals(store: Study) -> list[Any]:
-    """Return the totals of each setting's episodes, counted by the database, in the study's order.
-
-    Returns:
-        Rows with the columns `label`, `tasks`, `episodes`, `successes`, `steps`, `decodes`, `forwards`, `seconds`.
-    """
+    """Return the totals of each setting's episodes, counted by the database, in the study's order."""
     columns = [sa.func.sum(EPISODES.c[name]).label(name) for name in ("steps", "decodes", "forwards", "seconds")]
     successes = sa.func.sum(sa.cast(EPISODES.c.success, sa.Integer)).label("successes")
     query = (
@@ -76,8 +65,6 @@ class FoundEpisode:
 
     Attributes:
         id: Row number of the episode.
-        store: The study.
-        episode: Setting, task and seed.
         row: The episode's row, by column: setting, study, task, seed, block, start time and results.
         about: Machine and software versions that ran the episode.
         earlier: Seeds that must run before this episode, in this order, so that it gives the same tokens again. Empty
@@ -93,11 +80,10 @@ class FoundEpisode:
 
     @property
     def recording(self) -> Path:
-        """Path of the episode's recording, which may not exist."""
         return self.store.rollouts / self.episode.recording
 
     def decodes(self) -> tuple[list[DecodeRecord], list[int]]:
-        """Read the episode's decodes. Also return, for each decode, the control step that executes its first action."""
+        """Read the episode's decodes, and the control step at which each executes its first action."""
         from kerv_cli.episodes.rows import decode_records
 
         table = self.store.decodes([self.id])
@@ -105,12 +91,6 @@ class FoundEpisode:
 
 
 def find_episode(database: Database, number: int) -> FoundEpisode:
-    """Return one stored episode.
-
-    Args:
-        database: The database.
-        number: Row number of the episode.
-    """
     with database.reading() as connection:
         own = EPISODES.c["task", "seed", "order", "block", "started"]
         about = STUDIES.c.name.label("study"), STUDIES.c.kind, BLOCKS.c.about

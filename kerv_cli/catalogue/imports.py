@@ -31,8 +31,8 @@ _BLOCK = ("about", "run", "seeds")
 _FURTHER = ("order", "started")
 _ROW = (*map(attrgetter("name"), MEASURES), *_FURTHER)
 
+# Instructions that SQLite may execute per connection (about 1 s), plus STEPS_PER_BYTE for each byte of the file
 MOST_STEPS = 20_000_000
-"""Instructions that SQLite may execute per connection (about 1 s), plus STEPS_PER_BYTE for each byte of the file."""
 STEPS_PER_BYTE = 20
 _EVERY = 10_000
 
@@ -47,20 +47,15 @@ class ImportedEpisode:
     block: Mapping[str, Any]
 
 
+# A study with all its planned episodes, those that were run, and the command (without `kerv`) that ran it
 Found: TypeAlias = tuple[Study, Iterator[ImportedEpisode], tuple[str, ...]]
-"""Three values. First, a study to import, with all its planned episodes. Second, the episodes that were run, with their
-results. Third, the command-line arguments (without `kerv`) that ran the study. They are empty if unknown."""
 
 
 def import_databases(database: Database, files: Sequence[Path], name: str = "") -> tuple[list[str], list[str]]:
-    """Copy studies into a database. Studies whose name the database already has are left out.
-
-    Recordings and artifacts are not copied.
+    """Copy studies, without recordings and artifacts. Those whose name the database already has are left out.
 
     Args:
-        database: The database to copy to.
-        files: Database files to copy from.
-        name: New name of the study. Each file must then hold exactly one study. If empty, studies keep their names.
+        name: New name of the study. Each file must then hold exactly one study.
 
     Returns:
         Names of the imported studies, and a line of text about each study that was left out.
@@ -93,11 +88,8 @@ def database_in(path: Path) -> Path:
 def connect_foreign(path: Path) -> sqlite3.Connection:
     """Open a SQLite file from somebody else, read-only.
 
-    A small file can contain an endless query. So a connection may execute only a limited number of SQLite's
-    instructions. The limit grows with the file's size. Beyond the limit, the connection's queries fail.
-
-    Args:
-        path: The file.
+    A small file can contain an endless query. So a connection may execute only a number of instructions that grows with
+    the file's size. Then its queries fail.
     """
     size = regular(path).stat().st_size
     log = path.with_name(f"{path.name}-wal")
@@ -117,14 +109,6 @@ def connect_foreign(path: Path) -> sqlite3.Connection:
 
 
 def _in_database(path: Path, database: Database, name: str, stack: contextlib.ExitStack) -> list[Found]:
-    """Return the studies in a database file, ready to be added to another database.
-
-    Args:
-        path: The file to read. It stays open until `stack` is closed.
-        database: The database to import the studies into.
-        name: New name of each study. If empty, each study keeps its name.
-        stack: The file is closed when this stack is closed.
-    """
     engine = sa.create_engine("sqlite://", creator=lambda: connect_foreign(path), poolclass=sa.pool.NullPool)
     with _damage(path):
         connection = stack.enter_context(engine.connect())
@@ -137,18 +121,6 @@ def _in_database(path: Path, database: Database, name: str, stack: contextlib.Ex
 
 
 def _stored(connection: sa.Connection, path: Path, row: Any, database: Database, name: str = "") -> Found:
-    """Read a study from a row of the table `studies`, and prepare its import into another database.
-
-    Args:
-        connection: The database that the row comes from.
-        path: File of that database, for error messages.
-        row: The row.
-        database: The database to import the study into.
-        name: New name of the study. If empty, the study keeps its name.
-
-    Returns:
-        The study, its episodes that were run, and its command-line arguments; see `Found`.
-    """
     settings, episodes = stored_settings(connection, row.id)
     study = Study(database, name or row.name, row.kind, tuple(settings.values()), episodes, **row.about)
     runs = tables.RUNS.c
@@ -158,13 +130,6 @@ def _stored(connection: sa.Connection, path: Path, row: Any, database: Database,
 
 
 def _stored_episodes(connection: sa.Connection, path: Path, settings: dict[int, Setting]) -> Iterator[ImportedEpisode]:
-    """Yield the stored episodes of some settings.
-
-    Args:
-        connection: The database.
-        path: File of that database, for error messages.
-        settings: The settings, by their row number in that database.
-    """
     blocks, decodes = tables.BLOCKS.c, tables.DECODES
     of_block = blocks.id.label("block"), blocks.about, blocks.run, blocks.seeds
     stored = [*measures_in(connection), *tables.EPISODES.c[_FURTHER]]
@@ -186,13 +151,7 @@ def _stored_episodes(connection: sa.Connection, path: Path, settings: dict[int, 
 
 
 def _add(study: Study, episodes: Iterable[ImportedEpisode], command: Sequence[str]) -> None:
-    """Write a study and its episodes, which were run elsewhere, in one transaction.
-
-    Args:
-        study: The study.
-        episodes: The episodes that were run, with their results.
-        command: Command-line arguments (without `kerv`) of the import.
-    """
+    """Write a study, and its episodes that were run elsewhere, in one transaction."""
     from kerv_cli.lab.study import Plan, save_in  # imports torch
 
     with Run(study.database, study.kind, study.name, command) as record, study.database.writing() as connection:
@@ -218,7 +177,7 @@ def _damage(path: Path) -> Iterator[None]:
 
 
 def export_database(study: Study, folder: Path) -> Path:
-    """Write a study into a new kerv.db in a folder, and return that file's path. An existing kerv.db is replaced."""
+    """Write a study into a new kerv.db in a folder. An existing kerv.db is replaced."""
 
     def fill(new: Path) -> None:
         copy = Database(new, file_url(new))

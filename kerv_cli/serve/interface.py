@@ -26,11 +26,7 @@ class Interface:
             `signed_inverted` (1 closed, -1 open).
 
     Attributes:
-        actions: Action space of the policy.
-        space: Action space of the environment. If kerv does not know the environment, this is the policy's action
-            space.
-        observation: Observation space of the policy.
-        cameras: Names of the images that the policy reads.
+        space: Action space of the environment, or of the policy if kerv does not know the environment.
         size: Side of an image in pixels. 0 if the policy reads no images.
         privileged: Whether the policy reads the whole simulator state, not only proprioception.
         grip: The two gripper values in the environment's actions: first to close, then to open. Empty if unknown.
@@ -50,11 +46,7 @@ class Interface:
         self.grip = self.spec.grip if self.spec else ()
 
     def image(self, image: object, camera: str, key: str) -> np.ndarray:
-        """Check an image that a client sent, and return it.
-
-        Args:
-            image: The image, or a function that returns it. It must be (height, width, 3) uint8.
-        """
+        """Check an image (height, width, 3) uint8 that a client sent. It may be a function that returns it."""
         shape = frame_shape(camera, self.size)
         image = image() if callable(image) else image
         if isinstance(image, np.ndarray):
@@ -90,14 +82,7 @@ class Interface:
         return numbers[:few], np.concatenate([numbers, np.zeros(many - len(numbers))])
 
     def converted(self, actions: np.ndarray) -> np.ndarray:
-        """Return actions with the gripper's values in the client's convention, which the setting `gripper` chooses.
-
-        Args:
-            actions: (H, D), H actions of D DoFs in environment units.
-
-        Returns:
-            (H, D) float64.
-        """
+        """Return actions (H, D) in environment units, the gripper's values in the client's convention, as float64."""
         values, strict = actions.astype(np.float64), self.actions.is_strict
         if self.gripper in OPEN:
             values[:, strict] = np.where(values[:, strict] > 0.5, OPEN[self.gripper], -OPEN[self.gripper])

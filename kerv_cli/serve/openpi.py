@@ -34,7 +34,6 @@ def metadata(policy: Policy) -> dict[str, object]:
 
 
 def observation_of(interface: Interface, message: Message) -> Observation:
-    """Read the observation from a client's message."""
     prompt = text_of(message.get(PROMPT), PROMPT)
     images = {}
     for camera in interface.cameras:

@@ -1,12 +1,8 @@
 """`kerv calibrate`: measure numbers that KERV and HeiSD need, and write a JSON file (docs/methods.md §3, §4).
 
-The numbers are measured on demonstrations. The JSON file holds:
-
-- the noise of the kinematic predictors,
-- each task's K_S, the reference level of the kinematic variability K (how far drafts are from the target's tokens),
-- the ranges of the hand's curvature and path length, with which the boundary between retrieval and drafter normalises
-  both,
-- for each task the smallest similarity at which a retrieved chunk is executed without verification.
+They are measured on demonstrations: the noise of the kinematic predictors; each task's K_S, the reference level of the
+kinematic variability K (how far drafts are from the target's tokens); the ranges of curvature and path length at the
+boundary; each task's smallest similarity at which a retrieved chunk is executed without verification.
 """
 
 from __future__ import annotations
@@ -62,8 +58,8 @@ def plan_calibration(
 ) -> Plan[tuple[Path, stored.Calibration, list[str]]]:
     """Check what a calibration is measured on. The work measures its sections and writes them to one JSON file.
 
-    The reference levels K_S are not measured if `decodes` is 0 or the drafter is missing, the skip levels not without
-    a datastore. The work returns the file's path, the calibration, and a line per section that was not measured.
+    It returns the file's path, the calibration, and a line per section that was not measured: no K_S if `decodes` is 0
+    or the drafter is missing, no skip levels without a datastore.
     """
     device, _ = set_up(settings.runtime)
     artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
@@ -141,7 +137,6 @@ def presample(
     decodes: int,
     progress: OnProgress,
 ) -> dict[str, stored.Variability]:
-    """Measure how far drafts are from the target's tokens, by decoding observations of training episodes."""
     variability = {}
     for number, name in enumerate(tasks, 1):
         records: list[DecodeRecord] = []
@@ -159,8 +154,7 @@ def presample(
 def reference_level(records: Sequence[DecodeRecord], actions: ActionSpace, chunk: int) -> stored.Variability:
     """Return a task's reference level K_S: the median of the variability K over the decodes, for each measure of K.
 
-    Decoding divides by K_S, so it must not be 0. It is at least the smallest possible K above 0, which is the K of a
-    chunk in which a single token is off by one bin.
+    Decoding divides by K_S. So it is at least the K of a chunk in which a single token is off by one bin.
     """
     bin_width, moving = 2.0 / actions.tokens, chunk * int((~actions.is_strict).sum())
     levels = {}
@@ -173,10 +167,9 @@ def reference_level(records: Sequence[DecodeRecord], actions: ActionSpace, chunk
 
 
 def episode_decodes(decoder: Decoder, dataset: DemoDataset, index: int, decodes: int) -> list[DecodeRecord]:
-    """Decode observations that are spread evenly over one demonstration, and return the records of the decodes.
+    """Decode observations that are spread evenly over one demonstration. Decodes without a compared draft are left out.
 
-    The decoder also gets every action executed between these observations, because some methods use a history. A decode
-    that compared no draft with the target is left out.
+    The decoder also gets every action executed in between, because some methods use a history.
     """
     episode = dataset.load(index)
     rows = np.unique(np.linspace(0, len(episode.frame_steps) - 1, decodes).round().astype(int))
@@ -205,10 +198,7 @@ def fit_boundary(
 
 
 def completed(old: stored.Calibration, new: stored.Calibration) -> stored.Calibration:
-    """Return the old calibration, with the numbers of the new one added that the old one lacks.
-
-    The boundary ranges are those of `new`, because `fit_boundary` has already copied the old ranges into `new`.
-    """
+    """Return the old calibration, with the numbers of the new one that it lacks. `new` has both's boundary ranges."""
     known, found = old.noise["kalman"], new.noise["kalman"]
     columns = np.where(known.q, astuple(known), astuple(found))  # q and r
     noise = {"kalman": Noise(*map(tuple, columns.tolist()))}
@@ -227,10 +217,9 @@ def completed(old: stored.Calibration, new: stored.Calibration) -> stored.Calibr
 
 
 def episode_windows(episode: DemoEpisode, actions: ActionSpace, window: int, horizon: int) -> np.ndarray:
-    """Cut out the expert's actions around each control step (moment) that has `window` control steps before it.
+    """Cut out the expert's actions around each moment (control step) that has `window` control steps before it.
 
-    The last moments of an episode have fewer than `horizon` actions left. The missing actions come from the end of
-    the recording, which holds further actions of the expert after the episode's last control step.
+    At the end of an episode, actions come from the recording, which goes on after the last control step.
 
     Returns:
         (n, window + horizon, D) float32: the expert's normalised actions around each of the n moments, oldest first.
@@ -249,8 +238,10 @@ def read_windows(
     """Read the expert's actions around n moments (control steps) of episodes, see `episode_windows`.
 
     Returns:
-        Normalised actions of D DoFs before each moment (n, window, D) and from it on (n, H, D). The end effector's
-        positions in each episode, (T, 3) metres. The number of episodes of each task, as in `Demonstrations`.
+        - (n, window, D) normalised actions before each moment
+        - (n, H, D) normalised actions from it on
+        - (T, 3) metres, the end effector's positions in each episode
+        - the number of episodes of each task, as in `Demonstrations`
     """
     counts: dict[str, dict[str, int]] = {}
     parts, paths = [], []
@@ -298,8 +289,8 @@ def fit_filters(past: np.ndarray, future: np.ndarray) -> dict[str, Noise]:
 class Matches:
     """n datastore entries of one task, each compared with the most similar entry of another episode.
 
-    A match is good if the two chunks are nearly equal: the error is small, and all tokens of strict DoFs are the same.
-    Strict DoFs count separately, because a wrong gripper hardly changes the mean error but drops the object.
+    A match is good if the error is small and all tokens of strict DoFs are the same: a wrong gripper hardly changes the
+    mean error but drops the object.
     """
 
     similarity: np.ndarray  # (n,) float32, cosine
@@ -337,7 +328,6 @@ def lowest_level(matches: Matches, confidence: float, least: int = LEAST) -> flo
 
 
 def task_levels(matches: Matches, confidence: float) -> stored.SkipLevel:
-    """Return a task's s_min, the smallest similarity at which verification is skipped, and its bounds."""
     similarity, wrong = matches.similarity, 1 - confidence
     s_min = lowest_level(matches, confidence)
     if s_min is None:

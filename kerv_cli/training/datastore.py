@@ -104,7 +104,6 @@ def plan_datastore(settings: BuildDatastoreSettings, database: Database) -> Plan
 
 @torch.inference_mode()
 def entries_of(target: Any, episode: DemoEpisode, space: ObservationSpace, key: Sequence[str]) -> dict[str, np.ndarray]:
-    """Make the entries of an episode: one for every observation."""
     steps = observed_steps(episode, bool(target.cameras))
     tokens = target.actions.chunk_tokens(read_chunks(episode, steps, target.chunk))
     observations = observations_of(target, episode, steps, space)

@@ -1,11 +1,7 @@
 """The demonstrations of a command: open and check them, or choose who acts while `kerv demos` records them.
 
-A command opens one dataset, or several joined datasets.
-
-While demonstrations are recorded, the scripted expert or a policy acts. If a policy acts, the expert labels the states
-that the policy visits (DAgger; Ross, Gordon, Bagnell 2011). The policy may decode with any method. For example,
-`method=early_unverified` records the states that a drafter's chunks lead to without verification, so that the drafter
-can be trained on them.
+The scripted expert or a policy acts. If a policy acts, with any method, the expert labels the states that it visits
+(DAgger; Ross, Gordon, Bagnell 2011).
 """
 
 from __future__ import annotations
@@ -110,7 +106,6 @@ def demos_for(settings: S, target: TargetDescription, database: Database) -> tup
 
 
 def check_tasks(dataset: DemoDataset, names: Sequence[str]) -> None:
-    """Refuse demonstrations unless every task in `names` has an episode."""
     for task in names:
         if not dataset.of_tasks(task):
             recorded = ", ".join(dataset.manifest.tasks)
@@ -149,8 +144,8 @@ def seen_by(dataset: DemoDataset, camera: str, who: str, remedy: str) -> DemoDat
 class PolicyActor:
     """Chooses the actions that a recording executes: for each chunk, either the policy's or the expert's.
 
-    Task and seed determine in which chunks the expert acts. The decoder is never told whether an episode succeeded, so
-    no episode depends on earlier episodes.
+    Task and seed determine in which. The decoder is never told whether an episode succeeded, so no episode depends on
+    earlier ones.
     """
 
     def __init__(self, decoder_of: Callable[[str], Decoder], expert_share: float) -> None:
@@ -166,11 +161,7 @@ class PolicyActor:
         self.decoder.reset(world.task, seed, world.end_effector)
 
     def act(self, label: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the action (D,) to execute now.
-
-        Args:
-            label: (D,) the expert's action in this state. This action is returned if the expert acts in this chunk.
-        """
+        """Return the action (D,) to execute now. `label` (D,) is the expert's action in this state."""
         if self.executed is not None:
             self.decoder.observe(self.executed, self.world.end_effector)
         if not self.actions and self.random.random() < self.share:
@@ -185,12 +176,9 @@ class PolicyActor:
 
 @dataclass(frozen=True)
 class PolicyActs:
-    """A callable that makes the `PolicyActor` of a recording, in the process that records.
-
-    It holds the settings of the recording and a hash, but no weights.
+    """Makes the `PolicyActor` of a recording, in the process that records. It holds no weights.
 
     Attributes:
-        settings: Settings of the recording.
         sha256: Hash of the method and all its weights.
     """
 
@@ -199,10 +187,7 @@ class PolicyActs:
 
     @classmethod
     def of(cls, settings: DemosSettings, spec: EnvironmentSpec) -> PolicyActs:
-        """Check that the policy can act in an environment. Return the `PolicyActs` of the recording.
-
-        The recording may contain more camera views than the target sees, to train another target on them.
-        """
+        """Check that the policy can act in an environment. Recordings may have more views than the target sees."""
         name, world = settings.policy.target, settings.world
         description = _artifacts(settings).description
         description.check_world(name, spec.name, spec.actions, world.camera.size)
@@ -239,7 +224,6 @@ def _hash(settings: DemosSettings) -> str:
 
 
 def plan_demos(settings: DemosSettings) -> Plan[tuple[Path, DemoManifest]]:
-    """Check a recording. Its work records the episodes that are missing, and returns the folder and its manifest."""
     config, actor = recording_of(settings)
     config.spec.check_installed()
     folder = artifact(settings.results, "demos", settings.name or name_of(settings.task))

@@ -30,8 +30,7 @@ from kerv_cli.worlds import resolve_tasks
 def plan_drafter(settings: TrainDrafterSettings, database: Database) -> Plan[tuple[Path, Metrics]]:
     """Check the training of a drafter. Its work returns the drafter's folder and the metrics of the best weights.
 
-    The target decodes in the number format `runtime.dtype`. The drafter's own weights are trained in float32. A
-    training that was interrupted goes on.
+    The target decodes in `runtime.dtype`. The drafter is trained in float32. An interrupted training goes on.
     """
     drafter: TrainableDrafter = find("drafter", settings.drafter.kind, "drafter.kind").built()
     artifacts, train = Artifacts(settings.results, settings.policy), settings.train

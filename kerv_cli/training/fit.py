@@ -1,8 +1,6 @@
 """The optimisation of targets and drafters: schedule, averaged weights, validation, exact resume.
 
-A resumed run writes the same bytes as an uninterrupted run, on the same machine with the same number of threads. For
-this, the batch of step s depends only on the seed and s. The resume file holds the weights, their average, the
-optimiser's state and the metrics of all validations.
+A resumed run writes the same bytes as an uninterrupted run, on the same machine with the same number of threads.
 """
 
 from __future__ import annotations
@@ -142,10 +140,7 @@ class State:
             write_if_changed(self.folder / "log.csv", table.encode())
 
     def restore(self) -> None:
-        """Load weights, optimiser and progress from the folder's resume file, if there is one.
-
-        If steps are left, a line on stderr names the step at which the training resumes.
-        """
+        """Continue from the folder's resume file, if there is one, and say so on stderr."""
         path = self.folder / RESUME
         if not path.is_file():
             return
@@ -171,14 +166,10 @@ def check_finite(metrics: Metrics, step: int) -> None:
 
 
 def batches(count: int, settings: TrainSettings, weights: Tensor | None = None) -> Callable[[int], Tensor]:
-    """Return a function that draws the samples of a step's batch. Only `settings.seed` and the step determine them.
+    """Return a function: step -> indices (B,) int64 of its samples. Only `settings.seed` and the step determine them.
 
     Args:
-        weights: (count,) float64. Sample i is drawn in proportion to `weights[i]`. If None, all samples are
-            equally likely.
-
-    Returns:
-        The function. It takes the step, and returns the indices (B,) int64 of the samples.
+        weights: (count,) float64. Sample i is drawn in proportion to `weights[i]`. If None, all are equally likely.
     """
     cumulative = None if weights is None else weights.cumsum(0)
 
@@ -206,10 +197,9 @@ def schedule(step: int, settings: TrainSettings) -> float:
 
 @contextmanager
 def without_subnormals() -> Iterator[None]:
-    """Make the CPU treat subnormal numbers (below about 1e-38) as zero, if it can.
+    """Make the CPU treat subnormal numbers (below about 1e-38) as zero. Some CPUs compute 100 times slower with them.
 
-    The backward pass of the vision encoder's spatial softmax makes many subnormal numbers, and some CPUs compute a
-    hundred times slower with them. A thread that starts inside the context keeps this mode afterwards.
+    A thread that starts inside the context keeps this mode afterwards.
     """
     torch.set_flush_denormal(True)
     try:
@@ -222,8 +212,7 @@ def without_subnormals() -> Iterator[None]:
 def until_interrupted() -> Iterator[threading.Event]:
     """Turn the first Ctrl-C (SIGINT) or SIGTERM into an event, so that the training can finish its step.
 
-    A signal more than SAME_REQUEST seconds later raises KeyboardInterrupt. Signals that the process ignores stay
-    ignored.
+    A signal more than SAME_REQUEST seconds later raises KeyboardInterrupt. Ignored signals stay ignored.
     """
     stop = threading.Event()
     first = math.inf

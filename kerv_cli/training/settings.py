@@ -66,10 +66,7 @@ class Plan(Generic[T]):
 
 @dataclass
 class TrainSettings:
-    """Settings of the optimisation.
-
-    The batch of step s depends only on the seed and s. So a resumed run gives the same weights as an uninterrupted run.
-    """
+    """Settings of the optimisation."""
 
     steps: int = number(20_000, 1, 10**9, help="optimisation steps")
     batch: int = number(64, 1, 65_536, help="samples per step")

@@ -1,10 +1,8 @@
 """`kerv train target`: train a compact policy by behaviour cloning.
 
-One sample is one recorded control step: the observation, and the expert's next H actions without added noise.
-Validation uses held-out episodes. Two policies with the same token accuracy may differ widely in success. So with
-`train.closed_loop`, the success in simulated episodes decides which weights are best.
-
-Shapes: B samples of a batch, N tokens of a chunk, H control steps of a chunk, D degrees of freedom of an action.
+A sample is one recorded control step: the observation, and the expert's next H actions without added noise. Policies
+with the same token accuracy may differ widely in success. So with `train.closed_loop`, simulated episodes decide which
+weights are best. Shapes: B samples of a batch, N tokens of a chunk, H control steps of a chunk, D DoFs of an action.
 """
 
 from __future__ import annotations
@@ -59,8 +57,7 @@ VALIDATED = 2048  # maximum number of samples in a validation
 def plan_target(settings: TrainTargetSettings, database: Database) -> Plan[tuple[Path, Metrics]]:
     """Check a training of a compact policy. Its work returns the target's folder and the metrics of the best weights.
 
-    This function fills in `settings.demos`, `settings.task` and `settings.train.places`. A training that was
-    interrupted goes on.
+    It fills in `settings.demos`, `settings.task` and `settings.train.places`. An interrupted training goes on.
     """
     folder, train = new_target(settings.results, settings.name), settings.train
     refuse_contradictions(settings)
@@ -171,7 +168,6 @@ def settle_places(settings: TrainTargetSettings, dataset: DemoDataset) -> None:
 
 
 def initial_target(settings: TrainTargetSettings, camera: str, new: Path) -> Path | None:
-    """Return the folder of the target whose weights training starts from. None if `train.init` is not set."""
     name = settings.train.init
     if name is None:
         return None
@@ -213,10 +209,7 @@ def load_training(
 
 
 def state_range(dataset: DemoDataset) -> list[list[float]]:
-    """Return the range of each of the s numbers of a state: two lists of s percentiles, the 0.1th and the 99.9th.
-
-    The percentiles are measured on at most STATE_EPISODES episodes.
-    """
+    """Return the 0.1th and the 99.9th percentiles of the s numbers of a state, over at most STATE_EPISODES episodes."""
     count = len(dataset.episodes)
     states = np.concatenate([dataset.load(i).states for i in range(0, count, -(-count // STATE_EPISODES))])
     ends: list[list[float]] = np.percentile(states, [0.1, 99.9], axis=0).tolist()
@@ -265,16 +258,13 @@ def load_samples(
 
 
 def waypoints_of(episode: DemoEpisode, steps: np.ndarray, count: int, actions: ActionSpace) -> Tensor:
-    """Return where the hand will be at the next gripper changes, and at the episode's end.
+    """Return where the hand will be at the next gripper changes, and at the episode's end: (n, K, 3) float32, metres.
 
-    These positions come from the demonstration alone. No simulator state is needed. A gripper change is a control step
-    in which the expert's command of a strict DoF (the gripper) moves by more than an eighth of its range.
+    A gripper change is a control step in which the expert's command of a strict DoF moves by more than an eighth of its
+    range. No simulator state is needed.
 
     Args:
         steps: (n,) control steps.
-
-    Returns:
-        (n, K, 3) float32, metres.
     """
     commands = episode.labels[: episode.steps, actions.is_strict]
     changes = np.flatnonzero((abs(np.diff(commands, axis=0)) > actions.half[actions.is_strict] / 4).any(-1)) + 1
@@ -286,15 +276,9 @@ def waypoints_of(episode: DemoEpisode, steps: np.ndarray, count: int, actions: A
 
 
 def task_weights(tasks: Tensor, balance: float) -> Tensor | None:
-    """Return how likely each sample is to be drawn.
+    """Return how likely each sample is to be drawn: (n,) float64; None if all are equally likely.
 
-    A task that has the share p of the samples is drawn in proportion to p^(1 − balance).
-
-    Args:
-        tasks: (n,) index of each sample's task.
-
-    Returns:
-        (n,) float64 weights; None if all samples are equally likely.
+    A task that has the share p of the samples is drawn in proportion to p^(1 − balance). `tasks`: (n,) indices.
     """
     if balance == 0:
         return None
@@ -304,17 +288,10 @@ def task_weights(tasks: Tensor, balance: float) -> Tensor | None:
 
 
 def lit(images: Tensor, indices: Tensor, step: int, spread: float) -> Tensor:
-    """Change the light on images at random, as data augmentation.
+    """Change the light on images (B, 3, h, w) uint8 at random, as data augmentation.
 
     Each colour channel is multiplied by the exponential of a smooth random field. The field's standard deviation is
-    drawn uniformly from 0 to `spread` for each image.
-
-    Args:
-        images: (B, 3, h, w) uint8.
-        indices: (B,) indices of the samples. With `step`, they determine the random fields.
-
-    Returns:
-        (B, 3, h, w) uint8.
+    drawn uniformly from 0 to `spread` for each image. Step and `indices` (B,) of the samples determine the fields.
     """
     fields = []
     for index in indices.tolist():
@@ -342,10 +319,6 @@ class Imitation:
         self.learns_places = bool(target.cameras and settings.scene_weight)
 
     def tokens(self, batch: Samples) -> Tensor:
-        """Return the action tokens (B, n) int64 of B samples, on the target's device.
-
-        n is N, or less if all chunks end earlier, by an end token.
-        """
         tokens = self.module.actions.chunk_tokens(batch.chunks.numpy())
         lengths = (tokens != self.module.actions.end).sum(1) + 1
         return torch.from_numpy(tokens[:, : lengths.max()]).to(self.device)
@@ -354,9 +327,8 @@ class Imitation:
     def precision(self) -> Iterator[None]:
         """Compute in bfloat16 inside this context, if `train.bf16` is set and the device multiplies bfloat16 numbers.
 
-        GPUs multiply bfloat16 numbers, and so do CPUs with AMX or AVX512-BF16. Other CPUs are slower in bfloat16. In
-        bfloat16 on a CPU, attention runs without a fused kernel, because that kernel's backward pass takes four times
-        as long.
+        CPUs without AMX or AVX512-BF16 are slower in bfloat16. On a CPU, attention runs without a fused kernel in
+        bfloat16, because that kernel's backward pass takes four times as long.
         """
         gpu = self.device.type != "cpu"
         multiplies = gpu or torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported()
@@ -368,11 +340,7 @@ class Imitation:
             yield
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
-        """Return the loss of a batch, and the metrics to log.
-
-        Args:
-            indices: (B,) indices of the samples.
-        """
+        """Return the loss of the samples `indices` (B,), and the metrics to log."""
         batch = self.training.where(indices)
         inputs = batch.inputs(self.device)
         if self.settings.colour and inputs.images is not None:
@@ -397,8 +365,8 @@ class Imitation:
     def validate(self, module: nn.Module) -> Metrics:
         """Return metrics on the held-out episodes, with teacher forcing.
 
-        The score is minus the mean absolute error of the actions. If closed-loop success is measured, ten times the
-        success is added.
+        The score is minus the mean absolute error of the actions, plus ten times the closed-loop success if it is
+        measured.
         """
         assert isinstance(module, CompactTarget)
         chosen = torch.linspace(0, len(self.held_out) - 1, min(VALIDATED, len(self.held_out))).long()
@@ -436,10 +404,9 @@ class Imitation:
 
 
 def check_init(settings: TargetSettings, camera: str, description: TargetDescription, folder: Path) -> None:
-    """Refuse initial weights whose shapes differ from the new target's.
+    """Refuse initial weights of other shapes. Only size, chunk, code, norm and parallel may differ.
 
-    Only the settings `size`, `chunk`, `code`, `norm` and `parallel` may differ. The new target may see further camera
-    views after the views of the old target.
+    The new target may see further camera views after the views of the old target.
     """
     for name, value in asdict(settings).items():
         stored = description.settings.get(name)
