@@ -54,9 +54,8 @@ format: setup ## rewrite the code in the project's style
 release: setup ## build the wheel and the source into dist/, and run an episode from each in an empty environment
 	@scripts/release.sh $(BIN)/python
 
-pages: setup ## fill the figures of README.md and results/README.md from results/tables, and the map of modules in docs/layout.md
+pages: setup ## fill the figures of README.md and results/README.md from results/tables
 	@$(BIN)/python scripts/figures.py README.md results/README.md
-	@$(BIN)/python scripts/docs.py
 
 docs: setup ## build the pages as a site in build/site; a link that leads nowhere is an error
 	@$(BIN)/python -c 'import material' 2>/dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'

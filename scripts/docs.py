@@ -1,12 +1,10 @@
 """What `make docs` adds to the pages of docs/: the start page, the results with their plots, and the command reference.
 
 mkdocs calls `on_files`. Links of README.md and results/ are of the repository; here they become those of the site.
-Called as a program, it writes the map of modules in docs/layout.md (`make pages`).
 """
 
 from __future__ import annotations
 
-import ast
 import posixpath
 import re
 from collections.abc import Iterator
@@ -19,7 +17,6 @@ PAGES = {"index.md": "README.md", "results.md": "results/README.md", "log.md": "
 
 WIDTH = 110  # columns of a help text
 _LINK = re.compile(r"(\]\()([^)#\s]+)")
-_MODULES = re.compile(r"(?<=<!-- modules -->\n).*(?=<!-- /modules -->)", re.DOTALL)
 
 
 def on_files(files: Any, config: Any) -> Any:
@@ -29,8 +26,6 @@ def on_files(files: Any, config: Any) -> Any:
     for page in PAGES:
         files.append(File.generated(config, page, content=page_of(page)))
     files.append(File.generated(config, "reference.md", content=reference()))
-    for path in sorted(set(re.findall(r"\]\(\.\./(kerv_cli/[^)]+)\)", (ROOT / "docs/layout.md").read_text("utf-8")))):
-        files.append(File.generated(config, path, abs_src_path=str(ROOT / path)))
     return files
 
 
@@ -85,22 +80,3 @@ def help_of(path: tuple[str, ...]) -> str:
     if result.exit_code:
         raise RuntimeError(f"kerv {' '.join(path)} --help: {result.output}")
     return str(result.output).rstrip()
-
-
-def with_modules(text: str) -> str:
-    """The page docs/layout.md, with the first sentence of every module between its two comments."""
-    lines, folder = [], Path()
-    for path in sorted((ROOT / "kerv_cli").rglob("*.py"), key=lambda path: (path.parent, path.stem)):
-        described = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
-        sentence = re.split(r"(?<=[.])\s", described, maxsplit=1)[0].replace("\n", " ")
-        if path.parent != folder:
-            folder = path.parent
-            lines.append(f"\n**{folder.relative_to(ROOT)}/**\n\n")
-        lines.append(f"- `{path.name}`: {sentence}\n")
-    written = "".join([*lines, "\n"])
-    return _MODULES.sub(lambda _: written, text)
-
-
-if __name__ == "__main__":
-    page = ROOT / "docs/layout.md"
-    page.write_text(with_modules(page.read_text(encoding="utf-8")), encoding="utf-8")

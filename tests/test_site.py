@@ -1,6 +1,5 @@
 """The pages as a site: links, the reference of commands, and figures that are those of the committed tables."""
 
-import ast
 import re
 import subprocess
 import sys
@@ -50,19 +49,30 @@ def test_every_link_leads_to_a_file_and_a_heading(source):
             assert anchor in anchors(str(file.relative_to(ROOT))), f"{source}: {target}"
 
 
-def test_the_layout_names_every_module_and_its_walks_name_functions_that_exist(docs):
-    text = (ROOT / "docs/layout.md").read_text(encoding="utf-8")
-    modules, written = (re.findall(r"^(?:- `|\*\*)\S+", one, re.MULTILINE) for one in (text, docs.with_modules(text)))
-    assert modules == written, "run `make pages`"
-    assert len(modules) > len([*(ROOT / "kerv_cli").rglob("*.py")])
-    links = re.findall(r"\[`([\w.]+)`\]\(\.\./(kerv_cli/[\w/]+\.py)\)", text)
-    assert len(links) > 30
-    for name, path in links:
-        body = ast.parse((ROOT / path).read_text(encoding="utf-8")).body
-        for word in name.split("."):
-            found = [one for one in body if getattr(one, "name", "") == word]
-            assert found, f"docs/layout.md: {path} has no {name}"
-            body = found[0].body
+def test_the_pages_name_every_room_and_no_other():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    picture = "".join(re.findall(r"^```text\n(.*?)^```", text, re.MULTILINE | re.DOTALL))
+    rooms = sorted(path.parent.name for path in (ROOT / "kerv_cli").glob("*/__init__.py"))
+    assert sorted(re.findall(r"\w+", picture)) == sorted([*rooms, "api"])
+    assert sorted(re.findall(r"^\| `(\w+)/` \|", text, re.MULTILINE)) == rooms
+
+
+LONGEST = 180
+"""Characters in a line of a page. Tables and commands may be longer."""
+
+
+@pytest.mark.parametrize("source", [*SOURCES, "CONTRIBUTING.md"])
+def test_no_line_of_a_page_is_too_long(source):
+    lines = enumerate((ROOT / source).read_text(encoding="utf-8").splitlines(), 1)
+    assert [number for number, line in lines if len(line) > LONGEST and not line.startswith(("|", "<!--", "kerv "))] == []
+
+
+def test_the_pages_stay_short():
+    words = {path.name: len(path.read_text(encoding="utf-8").split()) for path in (ROOT / "docs").glob("*.md")}
+    assert sum(words.values()) <= 16_000
+    assert words["methods.md"] <= 6_000
+    assert words["measuring.md"] <= 1_500
+    assert words["formats.md"] <= 1_300
 
 
 def test_the_site_lists_every_page(docs):

@@ -27,7 +27,7 @@ from kerv_cli.base.errors import KervError, UnknownName, UsageError
 
 PLUGINS = "KERV_PLUGINS"
 
-_COMMANDS = "demos train prepare build calibrate rollout sweep work serve report runs board view estimate bench doctor"
+_COMMANDS = "doctor rollout sweep report board view demos train prepare build calibrate runs serve work estimate bench"
 
 MODULES: Mapping[str, Sequence[str]] = {
     "command": tuple(f"kerv_cli.cli.{name}" for name in _COMMANDS.split()),
