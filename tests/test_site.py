@@ -63,16 +63,8 @@ LONGEST = 180
 
 @pytest.mark.parametrize("source", [*SOURCES, "CONTRIBUTING.md"])
 def test_no_line_of_a_page_is_too_long(source):
-    lines = enumerate((ROOT / source).read_text(encoding="utf-8").splitlines(), 1)
-    assert [number for number, line in lines if len(line) > LONGEST and not line.startswith(("|", "<!--", "kerv "))] == []
-
-
-def test_the_pages_stay_short():
-    words = {path.name: len(path.read_text(encoding="utf-8").split()) for path in (ROOT / "docs").glob("*.md")}
-    assert sum(words.values()) <= 16_000
-    assert words["methods.md"] <= 6_000
-    assert words["measuring.md"] <= 1_500
-    assert words["formats.md"] <= 1_300
+    lines = (ROOT / source).read_text(encoding="utf-8").splitlines()
+    assert [line for line in lines if len(line) > LONGEST and not line.startswith(("|", "<!--", "kerv "))] == []
 
 
 def test_the_site_lists_every_page(docs):

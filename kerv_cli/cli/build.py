@@ -15,7 +15,7 @@ from kerv_cli.training.settings import BuildDatastoreSettings, BuildDrafterSetti
 @command(
     "build target",
     BuildTargetSettings,
-    keys="grow policy.target target checkpoint name statistics environment check replace results",
+    keys="grow policy.target target checkpoint name statistics environment replace results",
     typed={"target": "family", "policy.target": "base"},
 )
 def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
