@@ -19,12 +19,12 @@ from kerv_cli.cli.common import one_line_errors
 # Set before numpy loads: by default its matrix multiplications use every core, whatever runtime.threads says.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+# help of groups of commands, such as `kerv train`, that do nothing by themselves
 FAMILIES = {
     "train": "Train the target or a drafter.",
     "build": "Build artifacts that need no training.",
     "runs": "List, show, compare, repeat, export and remove runs: sweeps, rollouts, trainings, all that was made.",
 }
-"""Help for groups of commands, such as `kerv train`, that do nothing by themselves."""
 
 
 class Commands(FastFlags, TyperGroup):
@@ -33,11 +33,9 @@ class Commands(FastFlags, TyperGroup):
     prefix = ""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Return the words that can be typed after the group's name."""
         return list(dict.fromkeys(name.removeprefix(self.prefix).split()[0] for name in commands(self.prefix.strip())))
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return the command or the group of commands with this name. None if there is neither."""
         name = self.prefix + cmd_name
         below = commands(name)
         if name in below:
@@ -50,19 +48,13 @@ class Commands(FastFlags, TyperGroup):
         return family
 
     def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
-        """Complete the name of a command. A description stays on one line: fish completes each line of the answer."""
         found: list[Any] = super().shell_complete(ctx, incomplete)
-        for one in found:
+        for one in found:  # on one line, because fish completes each line of the answer
             one.help = one.help and textwrap.shorten(one.help, 45, placeholder=" …")
         return found
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        """Find the command that the arguments begin with. Names of two words, as in `demos import`, are tried first.
-
-        Returns:
-            The command's name, the command, and the arguments after it.
-        """
-        name = " ".join(args[:2])
+        name = " ".join(args[:2])  # names of two words, as in `demos import`, are tried first
         command = self.get_command(ctx, name) if len(args) > 1 else None
         if command is not None:
             return name, command, args[2:]
@@ -76,13 +68,11 @@ class Kerv(Commands):
     """The command `kerv` itself. It prints each error as one line."""
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
-        """Parse the options of `kerv` itself, such as --version. Print an error as one line."""
         self.words = list(args)
         with one_line_errors(self.words):
             return super().make_context(info_name, args, parent, **extra)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command that was typed. Print an error as one line."""
         with one_line_errors(self.words):
             return super().invoke(ctx)
 

@@ -14,8 +14,7 @@ from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, database_of, end_at_once, end_with_json, progress_bar
 
-BOARD_FILE = "static/board.css"
-"""File that every exported board has. `kerv board export` replaces a folder only if it has this file or is empty."""
+BOARD_FILE = "static/board.css"  # `kerv board export` replaces a folder only if it has this file or is empty
 
 
 @dataclass(kw_only=True)

@@ -40,7 +40,6 @@ class Command(Part):
     """A command `kerv NAME`. Its function's docstring becomes the help, with the section `Examples:` at its end.
 
     Args:
-        name: Name of the command, such as `train target`.
         settings: Dataclass of its settings. NoSettings if it has none.
         keys: Names of the settings that `--help` lists, separated by spaces.
         typed: Maps a key as typed on the command line to the name of the setting, if the two differ.
@@ -57,42 +56,31 @@ class Command(Part):
 
     @property
     def help(self) -> str:
-        """The docstring of the command's function, up to its examples."""
         return inspect.cleandoc(self.code.__doc__ or "").partition("\n\nExamples:\n")[0]
 
     @property
     def examples(self) -> list[str]:
-        """Command lines for the help."""
         lines = inspect.cleandoc(self.code.__doc__ or "").partition("\n\nExamples:\n")[2].splitlines()
         return list(map(str.strip, lines))
 
     @property
     def summary(self) -> str:
-        """The first sentence of the help, or its part before a semicolon."""
         return re.split(r"[.;]\s", self.help + " ")[0]
 
     @property
     def shown(self) -> list[str]:
-        """Names of the settings that `--help` lists. `store` comes after `results`."""
         keys = "" if self.settings is NoSettings else self.keys
         return re.sub(r"\bresults\b", "results store", keys).split()
 
 
-command = Command
-"""The decorator that declares a command."""
+command = Command  # the decorator that declares a command
 
 
 def schemas_of(part: Command) -> list[type]:
-    """Return the dataclasses of all settings that can be typed after a command.
-
-    The first one is the command's own. If the field `each` of the command names another command, the second one is the
-    dataclass of that command. For example, `sweep` names `rollout`, because each setting of a sweep is a rollout.
-    """
     return [part.settings, commands(part.each)[part.each].settings] if part.each else [part.settings]
 
 
 def fields_of(settings: Any) -> dict[str, Field[Any]]:
-    """Return the fields of a settings dataclass by name."""
     return {one.name: one for one in fields(settings)}
 
 
@@ -110,9 +98,6 @@ def commands(words: str = "") -> dict[str, Command]:
     """Return the commands whose names begin with `words`, by name, in the order of the help.
 
     Only the file that declares these commands is imported, so that help and error messages appear quickly.
-
-    Args:
-        words: First words of the names, such as `train`. If empty, all commands are returned.
     """
     files, file = MODULES["command"], f"kerv_cli.cli.{words.partition(' ')[0]}"
     found = parts("command", file if file in files else "")
@@ -121,10 +106,7 @@ def commands(words: str = "") -> dict[str, Command]:
 
 
 def typer_command(part: Command) -> TyperCommand:
-    """Make a typer command from a registered command.
-
-    Its `invoke` passes settings, overrides and names to the command's function.
-    """
+    """Make a typer command from a registered command."""
     words = {**CONTEXT, "allow_extra_args": True}  # typer would import pydantic to parse arguments
     made = _made(part.code, name=part.name, cls=CommandWithSettings, help=part.help, context_settings=words)
     made.part, made.short_help = part, part.summary
@@ -137,18 +119,16 @@ def typer_command(part: Command) -> TyperCommand:
 
 
 def _made(code: Callable[..., None], **more: Any) -> Any:
-    """Return typer's command for a function."""
     single = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
     single.command(**more)(code)
     return typer.main.get_command(single)
 
 
 def _with_settings(cfg: Cfg = False) -> None:
-    """Declare the option of every command with settings."""
+    pass
 
 
 def _values(part: Command, key: str) -> list[str]:
-    """Return the values that the setting `key` allows. Empty if its values are not names from a list."""
     if key == "task":
         from kerv_cli.worlds import task_names
 
@@ -162,16 +142,6 @@ def _values(part: Command, key: str) -> list[str]:
 
 
 def _split(part: Command, typed: list[str], named: bool) -> tuple[list[str], list[str]]:
-    """Split the arguments into overrides (`key=value`) and names.
-
-    Args:
-        part: The command.
-        typed: The arguments.
-        named: Whether the command takes names. If not, all arguments are overrides.
-
-    Raises:
-        UnknownName: An argument looks like an override, but the command has no such setting.
-    """
     keys = set(top_keys(part))
     filters = set(re.findall(r"(\w+)=", part.help.partition("\n\nNAME: ")[2]))
     overrides, names = [], []
@@ -187,17 +157,6 @@ def _split(part: Command, typed: list[str], named: bool) -> tuple[list[str], lis
 
 
 def _settings(part: Command, overrides: list[str], cfg: bool) -> Any:
-    """Return the settings of a command. With --cfg print them and end the command instead.
-
-    Args:
-        part: The command.
-        overrides: The overrides as typed.
-        cfg: Whether --cfg was typed.
-
-    Raises:
-        UsageError: An override is wrong, see `config.compose`.
-        StorageError: The command writes to the results folder, which cannot be written.
-    """
     named: list[str] = []
     for word in overrides:
         key, equals, value = word.partition("=")
@@ -215,7 +174,6 @@ class FastFlags:
     """Sets each flag that is not typed to False instead of None. Typer would import pydantic to convert None."""
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """Return the options of the command."""
         params: list[Any] = super().get_params(ctx)  # type: ignore[misc]
         for one in params:
             if getattr(one, "is_flag", False) and one.default is None:
@@ -230,7 +188,6 @@ class CommandWithSettings(FastFlags, TyperCommand):
     arguments: list[str]
 
     def invoke(self, ctx: Any) -> None:
-        """Run the command with the settings, names and options that were typed."""
         from kerv_cli.lab.command import chosen_store, noted
 
         part, options = self.part, ctx.params
@@ -266,7 +223,6 @@ class CommandWithSettings(FastFlags, TyperCommand):
         return [CompletionItem(f"{prefix}{x}{suffix}") for x in names if f"{prefix}{x}".startswith(incomplete)]
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
-        """Add the most used settings, the subcommands and the examples to the help."""
         below = commands(self.part.name)
         below.pop(self.part.name, None)
         has_cfg = "cfg" in map(attrgetter("name"), self.params)
@@ -286,15 +242,6 @@ class CommandWithSettings(FastFlags, TyperCommand):
 
 
 def _row(part: Command, key: str) -> tuple[str, str]:
-    """Return a line of the help about one setting.
-
-    Args:
-        part: The command.
-        key: The setting as typed on the command line.
-
-    Returns:
-        `key=default`, and the type with the description.
-    """
     name = part.typed.get(key, key)
     schema, *others = schemas_of(part)
     if name.split(".")[0] not in fields_of(schema):
@@ -311,7 +258,6 @@ def _row(part: Command, key: str) -> tuple[str, str]:
 
 @functools.cache
 def _defaults(schema: type) -> Any:
-    """Return the settings of a command without any override."""
     return compose("", [], schema)
 
 

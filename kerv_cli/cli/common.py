@@ -37,14 +37,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON o
 
 
 def end_with_json(value: object, code: int = 0) -> NoReturn:
-    """Print a value as indented JSON and end the command. NaN and infinity, which JSON cannot express, become null.
-
-    A data frame becomes a list of its rows.
-
-    Args:
-        value: The value to print.
-        code: Exit code of the command.
-    """
+    """Print a value as indented JSON and end the command. NaN and infinity become null, a data frame its rows."""
     typer.echo(json.dumps(_plain(value), indent=2, ensure_ascii=False))
     raise typer.Exit(code)
 
@@ -64,12 +57,7 @@ def _plain(value: object) -> object:
 
 
 def settings_yaml(settings: Any, indent: str = "") -> str:
-    """Return settings as YAML for `--cfg`, each with its description as a comment.
-
-    Args:
-        settings: A dataclass of settings.
-        indent: Spaces before every line.
-    """
+    """Return settings as YAML for `--cfg`, each with its description as a comment."""
     import yaml
 
     lines = []
@@ -88,12 +76,6 @@ def settings_yaml(settings: Any, indent: str = "") -> str:
 
 
 def end_with_plan(text: str, as_json: bool = False) -> NoReturn:
-    """Print what the command would do, and end the command. For the option --plan.
-
-    Args:
-        text: The plan.
-        as_json: Whether to print the plan as JSON.
-    """
     if as_json:
         end_with_json({"plan": text})
     typer.echo(text)
@@ -111,13 +93,10 @@ def end_at_once() -> NoReturn:
 
 @contextmanager
 def one_line_errors(words: Sequence[str]) -> Iterator[None]:
-    """Print an exception that is raised inside the block as one line, and exit.
+    """Print an exception that is raised inside the block as one line, and exit with its code.
 
-    The exit code is `exit_code` of a KervError, 2 for a command line that cannot be parsed, 130 for Ctrl-C and 1 for
-    any other exception. With KERV_TRACEBACK=1 the exception is raised again, so that its traceback is shown.
-
-    Args:
-        words: Command-line arguments after `kerv`.
+    The code is 2 for a command line that cannot be parsed, 130 for Ctrl-C, and 1 for what is no KervError. With
+    KERV_TRACEBACK=1 the exception is raised again. `words` are the command-line arguments after `kerv`.
     """
     try:
         yield
@@ -143,19 +122,13 @@ def one_line_errors(words: Sequence[str]) -> Iterator[None]:
 
 
 def _is_of_an_interrupt(error: BaseException | None) -> bool:
-    """Return whether an error was caused by Ctrl-C, which OmegaConf can turn into an error of its own."""
+    # OmegaConf can turn Ctrl-C into an error of its own
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
 
 
 def _parse_error(error: Any, words: Sequence[str]) -> str:
-    """Return the text for typer's parse error. For an unknown option the text also says how to write a setting.
-
-    Args:
-        error: Typer's exception.
-        words: Command-line arguments after `kerv`.
-    """
     name, message = getattr(error, "option_name", None), " ".join(error.format_message().split())
     if name is None or not message.startswith("No such option") or getattr(error, "possibilities", None):
         return message
@@ -169,14 +142,13 @@ def results_word(overrides: Iterable[str]) -> str:
 
 
 def quoted(word: str) -> str:
-    """Quote a word for the shell if needed. Quotes are double, because messages put commands in single quotes."""
     if shlex.quote(word) == word:
         return word
+    # double quotes, because messages put commands in single ones
     return '"' + re.sub(r'(["$`\\])', r"\\\1", word) + '"'
 
 
 def _refuse(message: str, code: int, error: BaseException | None, words: Sequence[str] = ()) -> None:
-    """Print an error in one line and exit. `words`: command-line arguments after `kerv`."""
     if error is not None and os.environ.get("KERV_TRACEBACK"):
         raise error
     if code == Interrupted.exit_code:
@@ -190,10 +162,6 @@ def with_results(message: str, words: Iterable[str]) -> str:
     """Add `results=` and `store=`, as the user typed them, to the commands of kerv that a message quotes.
 
     A command that has `results=` already, or that has no such setting, is not changed.
-
-    Args:
-        message: The message. Commands are in quotes, as in `'kerv calibrate task=reach'`.
-        words: Command-line arguments after `kerv`.
     """
     from kerv_cli.base.registry import parts
 
@@ -213,7 +181,6 @@ def with_results(message: str, words: Iterable[str]) -> str:
 
 
 def database_of(settings: CommandSettings) -> Database:
-    """Open the database of the results folder."""
     from kerv_cli.lab.database import opened  # imports SQLAlchemy, which --help and mistyped settings must not wait for
 
     return opened(settings.results)
@@ -244,8 +211,7 @@ def progress_bar(title: str, record: Run | None = None, has_estimate: bool = Fal
     Without a terminal, print a line after each tenth of the work instead.
 
     Args:
-        title: Text before the bar.
-        record: The command's row in the database, to which the progress is also written. None if there is no row.
+        record: The command's row in the database, to which the progress is also written.
         has_estimate: Whether the text says how much time is left. If not, the bar estimates and shows it.
 
     Yields:
@@ -279,7 +245,6 @@ def progress_bar(title: str, record: Run | None = None, has_estimate: bool = Fal
 
 
 def console(stderr: bool = False) -> Console:
-    """Return a rich console on standard output or standard error. Without a terminal, the console has 200 columns."""
     from rich.console import Console
 
     wide = None if (sys.stderr if stderr else sys.stdout).isatty() else 200
@@ -287,13 +252,6 @@ def console(stderr: bool = False) -> Console:
 
 
 def print_table(columns: Iterable[str], rows: Iterable[Iterable[object]], title: str | None = None) -> None:
-    """Print a table.
-
-    Args:
-        columns: Names of the columns.
-        rows: Cells of each row. None is shown as a dash.
-        title: A line above the table. It is never wrapped, because it may contain a path to copy.
-    """
     from rich.table import Table
 
     table = Table(*columns)
@@ -309,19 +267,10 @@ def _cell(value: object) -> str:
 
 
 def print_rows(rows: Sequence[Mapping[str, object]], title: str | None = None) -> None:
-    """Print a table of rows. All rows have the same keys, which become the names of the columns."""
     print_table(rows[0], (row.values() for row in rows), title)
 
 
 def print_figures(what: str, figures: Mapping[str, float], folder: object, as_json: bool = False) -> None:
-    """Print named numbers with four digits each, and a folder.
-
-    Args:
-        what: Header of the table.
-        figures: The numbers by name.
-        folder: Folder of the artifact that the numbers describe.
-        as_json: Whether to print the numbers and the folder as JSON.
-    """
     if as_json:
         end_with_json({"folder": folder, **figures})
     rows = []

@@ -80,7 +80,6 @@ def doctor(settings: DoctorSettings, as_json: AsJson = False) -> None:
 
 
 def check_machine(settings: DoctorSettings) -> list[Finding]:
-    """Check rendering, torch, the shipped policies, disk, database and display."""
     from kerv_cli.report.viewing.viewer import has_display
     from kerv_cli.targets.provenance import versions
     from kerv_cli.worlds import specs
@@ -121,11 +120,6 @@ def check_policy(settings: DoctorSettings) -> list[Finding]:
 
 
 def _rendering(spec: EnvironmentSpec, settings: DoctorSettings) -> str:
-    """Render camera images of an environment and time them. Return the result as text.
-
-    An image must not be empty, because a broken OpenGL backend can load without an error and render nothing. A
-    simulator that is an optional dependency of kerv may be missing, and may need more than 50 ms for an image.
-    """
     from kerv_cli.worlds.mujoco_world import choose_backend
 
     if not spec.installed:
@@ -137,7 +131,7 @@ def _rendering(spec: EnvironmentSpec, settings: DoctorSettings) -> str:
         began = time.perf_counter()
         for _ in range(20):
             frame = world.frame()
-            spread = int(frame.std())
+            spread = int(frame.std())  # a broken OpenGL backend can load without an error and render nothing
         milliseconds = 1000 * (time.perf_counter() - began) / 20
     need(spread, f"{backend} draws empty frames: set MUJOCO_GL=osmesa and run 'kerv doctor' again")
     says = f"{backend}, {milliseconds:.1f} ms a frame at {settings.world.camera.size}x{settings.world.camera.size}"
@@ -173,7 +167,6 @@ def _disk(settings: DoctorSettings) -> str:
 
 
 def _database(settings: DoctorSettings) -> str:
-    """Return which database is used, as text. Raises KervError if the database does not answer."""
     from kerv_cli.lab.runs import run_rows
 
     database = database_of(settings)

@@ -10,8 +10,7 @@ from kerv_cli.cli.command import command
 from kerv_cli.cli.common import ShowPlan, database_of, print_table, results_word
 from kerv_cli.training.settings import PrepareSettings
 
-NOT_OF_STEPS = ("for", "steps", "quick")
-"""Overrides that are not passed on to the commands of the single steps."""
+NOT_OF_STEPS = ("for", "steps", "quick")  # not passed on to the commands of the single steps
 
 
 @command(

@@ -38,14 +38,6 @@ Folder = Annotated[Path | None, typer.Option("--dir", help="Folder to write to; 
 
 
 def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a run") -> list[str]:
-    """Return the names of runs that were typed. The path of a study's file becomes the name of the study.
-
-    Args:
-        names: The names as typed.
-        least: Minimum number of names.
-        most: Maximum number of names.
-        what: What the user must name, for the error message.
-    """
     from kerv_cli.episodes.resolve import study_name
 
     if not least <= len(names) <= most:
@@ -123,7 +115,6 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
 
 
 def _total_row(row: Any) -> dict[str, object]:
-    """Return a setting's totals as a row to print. Batched episodes have no times."""
     from kerv_cli.report.statistics import wilson
 
     success = wilson(row.successes, row.episodes)

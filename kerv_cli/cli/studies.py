@@ -30,10 +30,8 @@ if TYPE_CHECKING:
     from kerv_cli.report.reprice import Priced
     from kerv_cli.report.tables import StudyData
 
-SECONDS_PER_EPISODE = 3.0
-"""Guess of the seconds per episode, for commands without a study's file, while no episode was measured."""
-BUSY = 1.2
-"""Load average per core above which a line says that other programs disturb the measured times."""
+SECONDS_PER_EPISODE = 3.0  # a guess, while no episode was measured and no study's file says it
+BUSY = 1.2  # load average per core above which a line says that other programs disturb the measured times
 
 
 def announce(resolved: ResolvedStudy, is_rollout: bool = False) -> None:
@@ -60,30 +58,17 @@ def check_installed(planned: Plan, resolved: ResolvedStudy) -> None:
 
 
 def _few(names: Sequence[str], what: str) -> str:
-    """Return up to three names as a list, or the number of names as in `10 tasks`.
-
-    Args:
-        names: The names.
-        what: What the names are, in plural, such as `tasks`.
-    """
     return ", ".join(names) if len(names) < 4 else f"{len(names)} {what}"
 
 
 def print_settings(resolved: ResolvedStudy) -> None:
-    """Print a study and each of its settings as YAML. For the option --cfg."""
     typer.echo(settings_yaml(resolved.study), nl=False)
     for label, settings in resolved.settings.items():
         typer.echo(f"--- # {label}\n{settings_yaml(settings)}", nl=False)
 
 
 def print_study_plan(planned: Plan, as_json: bool, guess: float = SECONDS_PER_EPISODE) -> None:
-    """Print which episodes would run, why, and how long that would take. For the option --plan.
-
-    Args:
-        planned: The plan.
-        as_json: Whether to print the plan as JSON.
-        guess: Seconds per episode, used if no episode was measured.
-    """
+    """Print which episodes would run, why, and how long that would take. `guess`: seconds, if none was measured."""
     from kerv_cli.lab.follow import TimeLeft
     from kerv_cli.lab.workers import disturbances
 
@@ -99,7 +84,6 @@ def print_study_plan(planned: Plan, as_json: bool, guess: float = SECONDS_PER_EP
 
 
 def _plan_rows(planned: Plan) -> list[dict[str, object]]:
-    """Return one table row per setting: numbers of missing and existing episodes, and why episodes will run."""
     from kerv_cli.lab.plan import grouped, seeds_text
 
     of_label = grouped(planned.study.episodes, attrgetter("setting.label"))
@@ -130,13 +114,9 @@ def run_plan(planned: Plan, guess: float = SECONDS_PER_EPISODE) -> Outcome:
 
 
 def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None = None) -> Callable[[Event], None]:
-    """Return a function that prints a line about each event of a running study and moves its progress bar.
+    """Return a function that prints a line about each event of a running study and moves its progress bar by `show`.
 
     If standard error is no terminal, only the first 100 episodes get a line each.
-
-    Args:
-        show: Moves the bar, see `progress_bar`.
-        left: Estimates the time left. If None, no time is shown.
     """
     from kerv_cli.lab.work import BlockStarted, BlocksWait, Counted, Preparing, SettingFailed, Started
 
@@ -187,16 +167,7 @@ def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None =
 
 
 def print_study(data: StudyData, all_columns: bool = False, how: str = "") -> None:
-    """Print the table of a study and its note.
-
-    A setting has no speedup if its episodes were not timed alternately with the baseline's. The output names such
-    settings, and the command that times them again.
-
-    Args:
-        data: The study.
-        all_columns: Whether to print all columns, not only the most important ones.
-        how: What to type to see all columns. If empty, `kerv report study=NAME --all`.
-    """
+    """Print the table of a study and its note. `how` is what to type to see all columns."""
     from kerv_cli.report.summary import SummaryTable, not_in_turn
     from kerv_cli.report.tables import split_values
 
@@ -215,7 +186,6 @@ def print_study(data: StudyData, all_columns: bool = False, how: str = "") -> No
 
 
 def print_prices(priced: Sequence[Priced]) -> None:
-    """Print the estimated speeds on other machines. Print nothing if `priced` is empty."""
     from kerv_cli.report.summary import ASSUMES, repriced_summary
 
     if priced:
@@ -225,7 +195,6 @@ def print_prices(priced: Sequence[Priced]) -> None:
 
 
 def print_verdict(report: Report) -> None:
-    """Print the last lines about a study: the verdict, the files to open, the recording to watch, the board."""
     from kerv_cli.report.verdict import caution, order_of
 
     data, study = report.data, report.data.study

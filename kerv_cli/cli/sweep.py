@@ -84,7 +84,6 @@ def sweep(overrides: list[str], cfg: Cfg = False, show_plan: ShowPlan = False, a
 
 
 def _list_studies(as_json: bool) -> None:
-    """Print the studies in conf/study and the number of episodes of each."""
     from kerv_cli.episodes.resolve import tasks_of
 
     rows = []

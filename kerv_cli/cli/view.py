@@ -29,12 +29,6 @@ def view(settings: CommandSettings, names: list[str]) -> None:
 
 
 def _place(settings: CommandSettings, name: str) -> Path:
-    """Return the recording, or the folder of recordings, that an argument means.
-
-    Args:
-        settings: Settings of the command.
-        name: A path, the name of a run, or `last`: the newest run that has recordings.
-    """
     path = Path(name).expanduser()
     if path.exists() or path.suffix == ".rrd":
         return path
