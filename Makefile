@@ -9,7 +9,7 @@ CODE := kerv_cli tests scripts
 test test-cpus: export OMP_NUM_THREADS := 1
 
 .NOTPARALLEL:
-.PHONY: help setup test test-cpus demo papers torture lint format release pages docs lock clean
+.PHONY: help setup test test-cpus demo papers torture trials lint format release pages docs lock clean
 
 help: ## list these rules
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -40,6 +40,9 @@ papers: setup ## train the policy of the papers' study by the commands of docs/t
 
 torture: setup ## kill commands, break their disk, damage their files, at random (MINUTES=1)
 	@$(BIN)/python -m pytest -s tests/reliability/torture.py
+
+trials: setup ## kill, stop and continue sweeps and workers at random (TRIALS=200)
+	@$(BIN)/python tests/reliability/trials.py $${TRIALS:-200}
 
 lint: setup ## check style, types, and that rooms import only what lies below
 	@$(BIN)/ruff check $(CODE)

@@ -141,7 +141,7 @@ WANTED = _table(
     sa.Column("task", _Text, primary_key=True),
     sa.Column("seed", sa.BigInteger, primary_key=True),
     *_required(sa.Integer, "study_id", "position"),  # study_id: that of the setting
-    sa.Column("episode_id", sa.ForeignKey("episodes.id", ondelete="SET NULL"), index=True),
+    sa.Column("episode_id", sa.ForeignKey("episodes.id", ondelete="SET NULL")),
     sa.Column("error", _Text),  # if the last attempt failed: the error in one line, then its traceback
     sa.Column("block", sa.Integer),  # number of the block in which it runs or ran; null: nobody asks for it now
     sa.Column("worker", _Text),  # name of the worker that has claimed it, or ran it
@@ -152,6 +152,8 @@ UNFINISHED = sa.and_(WANTED.c.block.is_not(None), WANTED.c.episode_id.is_(None),
 """Condition: the row waits for a worker, or has one. A row with neither block, episode nor error is not asked for."""
 for _name, _columns in {"wanted_blocks": ("study_id", "block"), "wanted_workers": ("worker",)}.items():
     sa.Index(_name, *(WANTED.c[one] for one in _columns), sqlite_where=UNFINISHED, postgresql_where=UNFINISHED)
+_IS_THERE = WANTED.c.episode_id.is_not(None)
+sa.Index("wanted_episodes", WANTED.c.episode_id, sqlite_where=_IS_THERE, postgresql_where=_IS_THERE)
 PLANNED = WANTED.join(SETTINGS).join(STUDIES)
 """Each planned episode with its setting and its study."""
 
