@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 
 import pytest
 from command import told
@@ -52,6 +53,7 @@ def test_weights_that_are_replaced_while_a_sweep_runs_fail_the_setting(policies,
 
 MAKES = """
 import sys
+import time
 from kerv_cli.base.errors import UsageError
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import Run
@@ -100,3 +102,15 @@ def test_a_killed_process_of_this_machine_is_known_at_once(tmp_path):
         assert len(list((tmp_path / ".workers").iterdir())) == 2
     bury(database)
     assert not list((tmp_path / ".workers").iterdir())
+
+
+def test_an_interrupt_in_a_transaction_frees_its_lock_before_the_heart_is_awaited(tmp_path, monkeypatch):
+    """As SQLAlchemy leaves it if Ctrl-C comes between BEGIN and the code that would roll back."""
+    monkeypatch.setattr("kerv_cli.lab.presence.BEAT_SECONDS", 0.05)
+    database, began = opened(tmp_path), time.monotonic()
+    with pytest.raises(KeyboardInterrupt), Presence(database):  # noqa: PT012
+        left = database.writing()
+        left.__enter__()
+        time.sleep(0.3)  # the heart waits for the lock
+        raise KeyboardInterrupt
+    assert time.monotonic() - began < 30.0

@@ -394,20 +394,24 @@ def _connection(path: Path) -> sqlite3.Connection:
 def _begin(connection: sa.Connection) -> None:
     """Start a transaction. If it will write, first wait until no other process writes.
 
-    So what a writer has read stays true until it commits. Ctrl-C can come between a transaction's first statement and
-    the code that would end it: a thread that begins the next one rolls such a transaction back.
+    So what a writer has read stays true until it commits.
     """
     if not connection.get_execution_options().get("kerv_writes"):
         return
     if connection.dialect.name == "postgresql":
         connection.exec_driver_sql("SELECT pg_advisory_xact_lock(5271009)")
         return
+    roll_back()
+    _begun.connection = connection.connection.dbapi_connection
+    connection.exec_driver_sql("BEGIN IMMEDIATE")
+
+
+def roll_back() -> None:
+    """Roll back what Ctrl-C has left open in this thread: a transaction whose end it kept from running."""
     before: sqlite3.Connection | None = getattr(_begun, "connection", None)
     if before is not None:
         with contextlib.suppress(sqlite3.ProgrammingError):  # it is closed, as it should be
             before.rollback()
-    _begun.connection = connection.connection.dbapi_connection
-    connection.exec_driver_sql("BEGIN IMMEDIATE")
 
 
 def _version(connection: sa.Connection) -> int | None:

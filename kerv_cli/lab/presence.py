@@ -20,7 +20,7 @@ import sqlalchemy as sa
 
 from kerv_cli.base.errors import KervError, StorageError
 from kerv_cli.base.files import storage_errors
-from kerv_cli.lab.database import UNFINISHED, WANTED, WORKERS, Database, clock
+from kerv_cli.lab.database import UNFINISHED, WANTED, WORKERS, Database, clock, roll_back
 
 BEAT_SECONDS = 5.0
 """Seconds between two heartbeats."""
@@ -143,6 +143,7 @@ class Presence:
                 self.beat_in(connection)
 
     def _stop(self) -> None:
+        roll_back()  # otherwise the heart may wait for this thread's lock
         self._ended.set()
         if self._heart.is_alive():
             self._heart.join()

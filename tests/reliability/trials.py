@@ -114,6 +114,7 @@ class Trial:
             if apart and ctypes.CDLL(None).unshare(CLONE_NEWPID) == 0:
                 child = os.fork()
                 if child:
+                    signal.signal(signal.SIGINT, lambda *_: os.kill(child, signal.SIGINT))
                     os._exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) % 256)
                 ctypes.CDLL(None).prctl(1, signal.SIGKILL)
             code = self._in_child(name, job)
