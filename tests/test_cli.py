@@ -193,7 +193,7 @@ def test_a_sweep_without_a_study_lists_the_studies_with_their_sizes(tmp_path):
     assert list(tmp_path.iterdir()) == []
     listed = {row["study"]: row for row in json.loads(kerv("sweep", "--json").stdout)}
     assert set(listed) == set(groups()["study"])
-    assert listed["stress"]["settings"] == 145
+    assert listed["stress"]["settings"] == 65
 
 
 def test_a_command_from_a_plugin_is_one_like_any_other(tmp_path, monkeypatch):

@@ -117,7 +117,7 @@ def test_everything_trains_on_recorded_observations_of_an_openvla(results):
     kerv(*calibrate)
     made = json.loads((results / "artifacts/calibration/rec/calibration.json").read_text())
     assert set(made["variability"]) == set(both(results)[1].manifest.instructions)
-    refused = refusal("build", "datastore", *common, "task=BACK", "key=[scene]", code=2)
+    refused = refusal("build", "datastore", *common, "task=BACK", "key=[scene]", "replace=true", code=2)
     assert "unknown part of the prompt 'scene'" in refused
 
 
@@ -284,7 +284,8 @@ def test_imports_whose_names_differ_in_a_dash_are_environments_of_their_own(resu
     for name, episodes in (("my-data", 0), ("my_data", 1)):
         alone("demos", "import", f"source={source}", f"name={name}", f"episodes={episodes}")
     for name, tasks in (("my-data", 2), ("my_data", 1)):
-        assert "6000 steps" in alone("train", "target", f"demos={name}", f"task={name.upper()}", "name=own", "--plan")
+        task, size = f"task={name.upper()}", "target.image_size=56"
+        assert "6000 steps" in alone("train", "target", f"demos={name}", task, size, "name=own", "--plan")
         assert len(specs()[name].tasks) == tasks
     DemoDataset.open(tmp_path / "artifacts/demos/my-data")
     assert [len(specs()[name].tasks) for name in ("my-data", "my_data")] == [2, 1]

@@ -17,7 +17,6 @@ from kerv_cli.base.limits import check_label
 from kerv_cli.base.paths import find_target
 from kerv_cli.base.registry import METHOD_KINDS, PART_GROUPS, AcceptancePart, ArtifactPart
 from kerv_cli.episodes.identity import NOT_DETERMINING, NOT_DETERMINING_RUNTIME, Setting, flat, work_of
-from kerv_cli.episodes.interface import read_interface
 from kerv_cli.episodes.settings import (
     CONSTANT,
     DEFAULT_TASKS,
@@ -288,8 +287,16 @@ def _settle(settings: Iterable[RolloutSettings], baseline: RolloutSettings, narr
     for setting in settings:
         setting.task = narrowed or setting.task or tasks
         setting.world = settled(setting.world, resolve_tasks(setting.task))
-        if setting.policy.kind == REMOTE and (pixels := read_interface(setting.policy.interface).pixels):
+        if pixels := _pixels_of(setting):
             setting.world.camera = replace(setting.world.camera, size=pixels, supersample=1)
+
+
+def _pixels_of(settings: RolloutSettings) -> int:
+    if settings.policy.kind != REMOTE:
+        return 0
+    from kerv_cli.episodes.interface import read_interface  # takes numpy
+
+    return read_interface(settings.policy.interface).pixels
 
 
 def _is_ar(settings: RolloutSettings) -> bool:
@@ -337,7 +344,7 @@ def idle_keys(settings: RolloutSettings) -> dict[str, str]:
     For the scripted expert and a server, other settings of methods are refused.
     """
     if settings.policy.kind != MODEL:
-        pixels = read_interface(settings.policy.interface).pixels if settings.policy.kind == REMOTE else 0
+        pixels = _pixels_of(settings)
         drawn = dict.fromkeys(("size", "supersample"), f"{settings.policy.interface} wants pictures of {pixels} pixels")
         unused = {f"world.camera.{name}": reason for name, reason in drawn.items() if pixels}
         return unused | ({"method": "the server decides it"} if settings.policy.kind == REMOTE else {})
