@@ -155,7 +155,7 @@ def check_tail(episode: DemoEpisode, steps: int, use: str) -> None:
     if tail < steps - 1:
         raise CheckpointError(
             f"the demonstrations have {tail} labels after an episode's end, {use} need {steps - 1}: "
-            "record them again with a longer tail"
+            f"take at most {tail + 1}, or import a dataset with tail={steps - 1}"
         )
 
 
