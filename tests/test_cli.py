@@ -346,6 +346,7 @@ ANSWERS = [
     ("rollout episodes=3 episodes=4", "episodes is given twice"),
     ("rollout seed=5", "seed=5 is a training seed"),
     ("rollout runtime.device=tpu", "runtime.device=tpu: known are cpu, cuda"),
+    ("demos task=reach runtime.device=tpu --plan", "runtime.device=tpu: known are cpu, cuda"),
     # methods
     ("rollout method=part.yaml", "part.yaml:2: unknown proposer 'draftr': did you mean drafter"),
     ("rollout method=range.yaml", "range.yaml:2: boundary.f_star=25.0: from 0 to 1"),

@@ -176,7 +176,7 @@ def test_tables_of_another_kerv_are_refused(database, monkeypatch, schema, messa
         begun(opened(database.results), "b")
 
 
-@pytest.mark.parametrize("harm", ["no database", "cut", "changed", "empty", "a folder"])
+@pytest.mark.parametrize("harm", ["no database", "cut", "changed", "bits", "empty", "a folder"])
 def test_a_damaged_file_is_one_line(tmp_path, harm):
     swept(tmp_path, STUDY)
     path = tmp_path / FILE
@@ -188,6 +188,7 @@ def test_a_damaged_file_is_one_line(tmp_path, harm):
         path.write_bytes({
             "no database": b"kerv" * 5000, "cut": content[:6000], "empty": b"",
             "changed": content[:4096] + bytes(len(content) - 4096),
+            "bits": content.replace(b"CREATE TABLE runs", b"CREATE TABL\xc5 runs"),
         }[harm])  # fmt: skip
     if harm == "empty":  # as a process leaves it that is killed before its first commit
         assert studies(opened(tmp_path)) == []
@@ -272,7 +273,8 @@ def test_an_odd_schema_version_is_one_line(tmp_path, version):
 @pytest.mark.parametrize(
     "row",
     [
-        "runs.command = '{'", "studies.about = '{\"other\": 1}'", "settings.identity = x'ff'",
+        "runs.command = '{'", "runs.message = CAST(x'ff' AS TEXT)", "studies.about = '{\"other\": 1}'",
+        "settings.identity = x'ff'",
         "settings.identity = '{\"target\": 5}'", "episodes.decode_seconds = x'ff'", "episodes.steps = 'x'",
         "episodes.initial_state = '{'", "blocks.about = '['",
     ],

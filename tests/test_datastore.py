@@ -317,7 +317,9 @@ def test_what_cannot_be_built_is_refused(results, changes, error, says):
 
 def test_demonstrations_that_do_not_fit_the_target_are_refused(copy):
     write_demos(copy / "artifacts/demos/few", LENGTHS, tail=2)
-    with pytest.raises(CheckpointError, match="2 labels after an episode's end, chunks of 4 need 3: take at most 3, or import"):
+    with pytest.raises(
+        CheckpointError, match="2 labels after an episode's end, chunks of 4 need 3: take at most 3, or import"
+    ):
         build(asked(copy))
     write_demos(copy / "artifacts/demos/few", LENGTHS, size=32)
     with pytest.raises(CheckpointError, match="32 x 32 pixels, the policy takes 96"):

@@ -160,6 +160,12 @@ def test_a_kill_between_the_weights_and_the_resume_file_keeps_the_right_best(tmp
         assert (folder / "log.csv").read_bytes() == (tmp_path / "whole/log.csv").read_bytes()
 
 
+def test_more_positions_than_the_embedding_has_are_refused():
+    settings = TargetSettings(width=8, layers=1, heads=2, feed_forward=8, grid=32, image_size=256)
+    with refused("target.grid=32 target.chunk=4: prompt and chunk have 1055 tokens in all, at most 1024 are possible"):
+        CompactTarget(settings, ACTIONS, OBSERVATION, vocabulary("metaworld"), "corner4")
+
+
 def test_weights_can_be_stored_in_fewer_bits(tmp_path):
     settings = TargetSettings(observation="state", width=64, layers=1, heads=2, feed_forward=96, scene_tokens=2)
     target = CompactTarget(settings, ACTIONS, OBSERVATION, vocabulary("metaworld"))

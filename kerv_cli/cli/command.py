@@ -27,7 +27,7 @@ from kerv_cli.base.config import compose, groups, plain_text
 from kerv_cli.base.errors import UnknownName
 from kerv_cli.base.paths import check_writable
 from kerv_cli.base.registry import MODULES, NoSettings, Part, parts
-from kerv_cli.base.settings import CommandSettings, choices_of
+from kerv_cli.base.settings import CommandSettings, RunSettings, choices_of
 from kerv_cli.cli.common import settings_yaml
 
 ARGUMENTS = ("settings", "overrides", "names")
@@ -201,6 +201,10 @@ class CommandWithSettings(FastFlags, TyperCommand):
                 value = options.get(option.name)
                 if value not in (None, False):
                     line += [option.opts[0]] if value is True else [option.opts[0], str(value)]
+            if options.get("plan") and isinstance(given.get("settings"), RunSettings):
+                from kerv_cli.base.runtime import device_of  # imports torch
+
+                device_of(given["settings"].runtime)
             with noted(line):
                 part.code(**{name: given[name] for name in self.arguments}, **options)
 

@@ -312,7 +312,7 @@ class Database:
             hint = "check that the server runs, or leave out store=" if is_away else "check the rights of its user"
             kind = Unanswered if is_away else StorageError
             return kind(f"store={self.shown} {'failed' if is_away else 'refused a statement'} ({why}): {hint}")
-        if "malformed" in why or "not a database" in why:
+        if any(words in why for words in ("malformed", "not a database", "decode")):
             return self._damaged(why)
         hint = ""
         if "lock" in why:

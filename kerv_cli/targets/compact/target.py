@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
 from kerv_cli.engine.draft import upload
@@ -35,7 +35,7 @@ from kerv_cli.targets.checkpoint import FLOAT32, TargetDescription, save_module,
 from kerv_cli.targets.compact import features
 from kerv_cli.targets.compact.features import VisionEncoder, WordTokenizer, mlp
 from kerv_cli.targets.compact.program import Compilable, CompilableLinear, Program, load_compiled
-from kerv_cli.targets.compact.trunk import Trunk
+from kerv_cli.targets.compact.trunk import POSITIONS, Trunk
 from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.worlds.views import frame_shape, views_of
 
@@ -105,6 +105,11 @@ class CompactTarget(Compilable):
         views = len(views_of(camera)) if self.cameras else 0
         self.segments, self.frame_shape = _segments(s, views), frame_shape(camera, s.image_size)
         self.max_prompt = self.segments["proprioception"].stop
+        if (positions := self.max_prompt + actions.longest(s.chunk)) > POSITIONS:
+            raise UsageError(
+                f"target.grid={s.grid} target.chunk={s.chunk}: prompt and chunk have {positions} tokens in all, at "
+                f"most {POSITIONS} are possible"
+            )
         self.pooled_width = s.width * (s.scene_tokens + (3 if self.cameras else 2))
         p, places = len(observation.proprioception), len(observation.places)
         self.register_buffer("centre", torch.tensor(observation.centre), persistent=False)
