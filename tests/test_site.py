@@ -67,6 +67,14 @@ def test_no_line_of_a_page_is_too_long(source):
     assert [line for line in lines if len(line) > LONGEST and not line.startswith(("|", "<!--", "kerv "))] == []
 
 
+def test_the_pages_stay_short():
+    words = {path.name: len(path.read_text(encoding="utf-8").split()) for path in (ROOT / "docs").glob("*.md")}
+    assert sum(words.values()) <= 19_000
+    assert words["methods.md"] <= 6_900
+    assert words["measuring.md"] <= 1_500
+    assert words["formats.md"] <= 1_300
+
+
 def test_the_site_lists_every_page(docs):
     settings = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
     listed = re.findall(r"[\w-]+\.md", str(settings["nav"]))
