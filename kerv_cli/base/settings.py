@@ -43,7 +43,7 @@ class RuntimeSettings:
     dtype: str = choice("float32", "float32", "bfloat16", "float16", help="number format of the models")
     threads: int = number(1, 1, 256, help="torch's threads in each process")
     workers: int = number(1, 0, 4096, help="sweeps: number of processes that run episodes at once; 0: start none")
-    launch: str = setting("", "sweeps: shell command that starts workers elsewhere; {command} is `kerv work …`")
+    launch: str = setting("", "sweeps: shell command that starts workers elsewhere; {command} is a worker's line")
 
 
 REPLACE = "replace what another command has made under this name"

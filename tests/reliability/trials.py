@@ -159,7 +159,7 @@ class Trial:
             failed = sum(len(failure.episodes) for failure in outcome.failed)
             told = {"study": study.name, "planned": len(study.episodes), "done": len(outcome.done),
                     "reused": len(outcome.reused), "failed": failed, "quiet": quiet, "pid": os.getpid()}  # fmt: skip
-            trial._tell("sweep", told | {"reasons": [failure.reason for failure in outcome.failed]})
+            trial._tell("sweep", told)
 
         return job
 
@@ -288,8 +288,6 @@ class Trial:
             load = max(1.0, os.getloadavg()[0])
             if told.get("quiet", 0.0) > QUIET * load and told["pid"] not in self.stopped:
                 wrong.append(f"nothing was said for {told['quiet']:.1f} s")
-            if any("workers died" in reason for reason in told.get("reasons", ())):
-                wrong.append(f"deaths were counted: {told}")
         self.weights.write_text("planned")
         for study in (base, other):
             self.begin("last", self.sweep(study))
