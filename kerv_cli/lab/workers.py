@@ -115,7 +115,7 @@ def workers(plan: Plan, run: str, say: Callable[[str], object] = lambda line: No
 def _launch(line: str, environment: dict[str, str]) -> None:
     done = subprocess.run(line, shell=True, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
-        said = last_line(done.stderr) or last_line(done.stdout) or f"exit code {done.returncode}"
+        said = " ".join((done.stderr or done.stdout).split())[-300:] or f"exit code {done.returncode}"
         raise KervError(f"runtime.launch: {line} failed: {said}")
 
 
