@@ -93,7 +93,7 @@ def asked(
     results: Path, target: str = "nano-state", named: str | None = None, **changes: Any
 ) -> BuildDatastoreSettings:
     policy = PolicySettings(target=target, artifacts={"datastore": named})
-    chosen = BuildDatastoreSettings(policy=policy, demos="few", task=list(TASKS), results=str(results))
+    chosen = BuildDatastoreSettings(policy=policy, demos="few", task=list(TASKS), results=str(results), replace=True)
     return replace(chosen, **changes)
 
 

@@ -27,6 +27,7 @@ from test_decoding_lossless import RandomTrees, assert_adds_up, decode, plain_gr
 from torch import Tensor
 
 from kerv_cli.base.errors import KervError
+from kerv_cli.base.paths import artifact
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
@@ -46,7 +47,10 @@ def checkpoint(tmp_path_factory):
 
 def imported(checkpoint: Path, results: Path, **chosen: Any) -> Path:
     options = {"prompt_tokens": 120, **chosen}
-    return import_checkpoint(BuildTargetSettings(checkpoint=str(checkpoint), results=str(results), **options))[0]
+    settings = BuildTargetSettings(checkpoint=str(checkpoint), results=str(results), **options)
+    folder = artifact(str(results), "target", settings.name)
+    import_checkpoint(settings, folder)
+    return folder
 
 
 def loaded(folder: Path, dtype: torch.dtype = torch.float32) -> OpenVLATarget:

@@ -1,18 +1,22 @@
 """No command replaces what another command has made, unless `replace=true` is typed."""
 
-import contextlib
 import multiprocessing
 import os
 import shutil
+import signal
 from pathlib import Path
+from random import Random
 
 import pytest
+import torch
 from command import kerv, process, refusal, told
 
-from kerv_cli.base.errors import Interrupted, KervError, UsageError
-from kerv_cli.base.files import owned, temporary_beside
-from kerv_cli.base.paths import RELEASED, artifact, check_free, check_name
+from kerv_cli.base.errors import UsageError
+from kerv_cli.base.files import owned, temporary_beside, unfinished
+from kerv_cli.base.paths import RELEASED, RESUME, artifact, check_free, check_name
 from kerv_cli.engine.chunk import WINDOW
+from kerv_cli.targets.checkpoint import load_target, read_target
+from kerv_cli.training.fit import Destination
 from kerv_cli.training.settings import CalibrateSettings
 
 TRAINING = ("target=nano", "target.observation=state", "demos=few", "train.batch=2", "train.steps=2")
@@ -112,7 +116,7 @@ def test_a_name_does_not_shadow_a_policy_that_ships(tmp_path, name):
 def test_names_are_limited_in_bytes(tmp_path):
     assert "380 bytes: at most 200" in refusal("train", "target", f"name={'é' * 190}", f"results={tmp_path}", code=2)
     folder = artifact(str(tmp_path), "target", check_name("é" * 100, "name"))
-    with owned(folder, lambda: False):
+    with owned(folder, lambda: None):
         folder.mkdir()
         temporary_beside(folder).mkdir()
 
@@ -121,7 +125,7 @@ def test_names_are_limited_in_bytes(tmp_path):
 
 
 def hold(folder: Path, ready: "multiprocessing.synchronize.Event", end: "multiprocessing.synchronize.Event") -> None:
-    with owned(folder, lambda: True):
+    with owned(folder, lambda: None):
         ready.set()
         end.wait(60)
 
@@ -138,44 +142,79 @@ def test_two_trainings_of_one_name_do_not_write_at_the_same_time(results, monkey
     assert not folder.exists()
     holder.kill()  # the lock ends with its process
     holder.join()
-    with owned(folder, lambda: False):
+    with owned(folder, lambda: None):
         pass
 
 
 def test_a_lock_needs_no_process_id(tmp_path):
     text = (
         f"from pathlib import Path; from kerv_cli.base.files import owned; import contextlib\n"
-        f"with owned(Path({str(tmp_path / 'x')!r}), lambda: True): print('held')"
+        f"with owned(Path({str(tmp_path / 'x')!r}), lambda: None): print('held')"
     )
-    with owned(tmp_path / "x", lambda: True):
+    with owned(tmp_path / "x", lambda: None):
         assert "another command is making" in process("-c", text).stderr
     assert process("-c", text).stdout == "held\n"
 
 
-@pytest.mark.parametrize(
-    ("error", "made", "left"),
-    [
-        (None, "new", "new"),
-        (KervError("x"), "new", "old"),
-        (KeyboardInterrupt(), "new", "new"),
-        (Interrupted("x"), None, "old"),
-        (UsageError("x"), None, "old"),
-    ],
-)
-def test_what_is_replaced_comes_back_after_a_failure(tmp_path, error, made, left):
-    folder = tmp_path / "a"
-    folder.mkdir()
-    (folder / "old").touch()
-    expected = pytest.raises((KervError, KeyboardInterrupt)) if error else contextlib.nullcontext()
-    with expected, owned(folder, lambda: False):
-        assert not folder.exists()
-        if made:
-            folder.mkdir()
-            (folder / made).touch()
-        if error:
-            raise error
-    assert os.listdir(folder) == [left]
-    assert [name for name in os.listdir(tmp_path) if name.endswith(".tmp")] == []
+# --- a command that replaces is killed
+
+KILLED = """
+import os, signal, sys
+from kerv_cli.base import files
+from kerv_cli.cli.app import app
+
+left, sync = int(sys.argv[1]), files.sync
+
+def killed(path):
+    global left
+    left -= 1
+    if not left:
+        os.kill(os.getpid(), signal.SIGKILL)
+    sync(path)
+
+files.sync = killed
+app(sys.argv[2:])
+"""
+
+
+@pytest.mark.bits
+@pytest.mark.usefixtures("quick_training")
+def test_a_killed_training_that_replaces_leaves_the_old_weights_and_goes_on(results):
+    words = ["train", "target", *TRAINING[:-1], "train.steps=4", "train.validate_every=1", f"results={results}"]
+    told(*words, "name=whole")
+    whole, old = (read_target(results / "artifacts/target" / name).sha256 for name in ("whole", "nano-state"))
+    folder, random = results / "artifacts/target/nano-state", Random(70)
+    words += ["name=nano-state", "replace=true"]
+    for moment in (random.randrange(12, 24), random.randrange(3, 14)):  # a validation syncs the disk 12 times
+        run = process("-c", KILLED, str(moment), *words, OMP_NUM_THREADS="1")
+        assert run.returncode == -signal.SIGKILL, run.stderr
+        load_target(folder)
+        assert read_target(folder).sha256 == old
+        assert unfinished(folder).is_dir()
+    assert "resuming at step" in told(*words)
+    assert read_target(folder).sha256 == whole
+    assert not unfinished(folder).exists()
+    assert {RESUME, "curves.png"} < set(content(folder))
+
+
+def test_an_unfinished_training_of_other_settings_is_begun_again(tmp_path):
+    folder, other = tmp_path / "a", tmp_path / ".a.new"
+    for path, identity, step in ((folder, "old", 9), (other, "abandoned", 3)):
+        path.mkdir()
+        torch.save({"identity": identity, "step": step}, path / RESUME)
+    for identity, steps, kept in (("abandoned", 5, True), ("abandoned", 2, False), ("new", 5, False)):
+        place = Destination(folder, identity, steps, "name", replace=True, begun=True)
+        place.check()
+        opened = place.opened()
+        made = opened.__enter__()
+        assert made == other
+        assert (made / RESUME).exists() == kept
+        torch.save({"identity": "abandoned", "step": 3}, made / RESUME)
+        assert not opened.__exit__(KeyboardInterrupt, KeyboardInterrupt(), None)
+    with place.opened() as made:
+        (made / "new").touch()
+    assert os.listdir(folder) == ["new"]
+    assert os.listdir(tmp_path) == ["a"]
 
 
 def test_an_existing_file_or_folder_is_refused(tmp_path):
@@ -217,7 +256,7 @@ def test_a_recording_by_a_policy_honours_the_device_and_the_format(results, monk
     from kerv_cli.training.demonstrations import plan_demos, recording_of
     from kerv_cli.training.settings import DemosSettings
 
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: None)
     words = ["policy=state", "policy.target=nano-state", "task=drawer-close", "name=d", f"results={results}"]
     assert "no CUDA device" in refusal("demos", *words, "runtime.device=cuda", "--plan", code=2)
     settings = compose("demos", [*words, "runtime.dtype=bfloat16"], DemosSettings)
@@ -230,9 +269,17 @@ def test_a_recording_by_a_policy_honours_the_device_and_the_format(results, monk
     assert plan_demos(settings).units == 100
 
 
-def test_the_plan_of_a_training_measures_how_long_it_takes(results):
-    words = ("train", "target", "name=planned", *TRAINING[:-1], f"results={results}", "--plan")
-    line = kerv(*words).stdout
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("target", "name=planned", *TRAINING[:-1]),
+        ("drafter", "policy.target=nano-vision", "demos=few", "policy.artifacts.drafter=planned"),
+        ("drafter", "drafter=early", "policy.target=nano-state", "demos=few", "policy.artifacts.early=planned"),
+    ],
+)
+def test_the_plan_of_a_training_measures_how_long_it_takes(results, words):
+    before = artifacts(results)
+    line = kerv("train", *words, f"results={results}", "--plan").stdout
     assert "measured now" in line
     assert "unknown" not in line
-    assert not (results / "artifacts/target/planned").exists()
+    assert artifacts(results) == before

@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from kerv_cli.base.errors import CheckpointError, Interrupted, StorageError, UsageError
+from kerv_cli.base.errors import CheckpointError, StorageError, UsageError
 
 MOST_TEXT = 2**28
 """Maximum size of a JSON file in bytes. kerv's own files are far smaller."""
@@ -136,47 +136,53 @@ def set_aside(folder: Path) -> Path:
 
 
 def _exchange(a: Path, b: Path) -> None:
-    """Replace folder `b` by folder `a`. If the file system can, exchange both in one step. Else remove `b` first."""
+    """Replace folder `b` by folder `a`, in one step if the file system can exchange both."""
     libc = ctypes.CDLL(None, use_errno=True)
     if hasattr(libc, "renameat2"):
         here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
         if libc.renameat2(here, os.fsencode(a), here, os.fsencode(b), exchange) == 0:
             return
-    shutil.rmtree(b)
+    old = temporary_beside(b)
+    os.rename(b, old)
     os.rename(a, b)
+    remove(old)
 
 
 @contextlib.contextmanager
-def owned(path: Path, resumes: Callable[[], bool]) -> Iterator[None]:
-    """Hold a lock of the operating system on a new file or folder, and replace what is there once the block has ended.
+def owned(path: Path, check: Callable[[], object]) -> Iterator[None]:
+    """Hold a lock of the operating system on a file or folder that the block makes.
 
-    If the block fails, what was there comes back. An interrupted one keeps what it has made, to go on from there.
-
-    Args:
-        path: The file or folder that the block makes.
-        resumes: Called with the lock held. It refuses to replace what is there, or returns whether the block goes on
-            with it.
+    `check` is called with the lock held. It refuses to replace what is there.
     """
-    lock, old = path.with_name(f".{path.name}.lock"), temporary_beside(path)
     with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        file = lock.open("a")
+        file = path.with_name(f".{path.name}.lock").open("a")
     with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise UsageError(f"another command is making {path}: wait for it, or choose another name") from None
-        if not resumes() and path.exists():
-            path.rename(old)
+        check()
+        yield
+
+
+def unfinished(folder: Path) -> Path:
+    """Return the hidden folder in which a training is made that replaces `folder` once it is complete."""
+    folder = folder.resolve()  # a link to a folder on another disk stays one
+    return folder.with_name(f".{folder.name}.new")
+
+
+def link_files(folder: Path, new: Path) -> None:
+    """Give the files of a folder second names in another one. Without hard links in the file system, copy them."""
+
+    def link(source: str, name: str) -> None:
         try:
-            yield
-        except BaseException as error:
-            if old.exists() and not (isinstance(error, Interrupted | KeyboardInterrupt) and path.exists()):
-                remove(path)
-                old.rename(path)
-            raise
-        finally:
-            remove(old)
+            os.link(source, name)
+        except OSError:
+            shutil.copy2(source, name)
+
+    temporary = shutil.ignore_patterns(".*.tmp")
+    shutil.copytree(folder, new, symlinks=True, ignore=temporary, copy_function=link, dirs_exist_ok=True)
 
 
 def visible(folder: Path) -> list[Path]:

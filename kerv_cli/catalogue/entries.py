@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import sqlalchemy as sa
 
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
-from kerv_cli.base.files import clean, read_mapping, read_text, set_aside, sha256_of, visible
+from kerv_cli.base.files import clean, read_mapping, read_text, set_aside, sha256_of, unfinished, visible
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.paths import shipped_dir
 from kerv_cli.base.registry import ArtifactPart
@@ -385,7 +385,8 @@ def remove(run: RunEntry, database: Database) -> None:
         store_of(run, database).remove()
     set_labels(database, run.id, {})
     forget(database, run.kind, run.id if run.has_episodes else run.id.removeprefix(f"{run.kind}/"))
-    shutil.rmtree(gone, ignore_errors=True)
+    for folder in (gone, unfinished(run.folder)):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def plan_of(run: RunEntry, database: Database) -> Plan:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Any
+
 from kerv_cli.base.errors import UsageError
-from kerv_cli.base.files import owned
+from kerv_cli.base.files import owned, write_folder
 from kerv_cli.base.paths import check_free, find_target, new_target
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, database_of, made, print_figures
@@ -37,13 +40,10 @@ def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
     if settings.grow.width and find_target(settings.results, settings.base).resolve() == folder.resolve():
         raise UsageError(f"name={settings.name}: a target cannot grow from itself, choose another name=")
 
-    def check() -> bool:
-        check_free(folder, "name", settings.replace)
-        return False
-
+    check, figures = partial(check_free, folder, "name", settings.replace), dict[str, Any]()
     check()
     with making(database_of(settings), "target", folder), owned(folder, check):
-        folder, figures = importer(settings)
+        write_folder(folder, lambda new: figures.update(importer(settings, new)))
     print_figures("target", figures, folder, as_json)
 
 

@@ -198,7 +198,7 @@ def made(plan: Plan[T], database: Database, show: bool = False, as_json: bool = 
     if show:
         time = runs.time_of(database, plan.kind, current_command(), plan.units)
         if plan.seconds and time.startswith("time unknown"):
-            time = about(plan.seconds(), "from two steps, measured now")
+            time = about(plan.seconds(), "from a few steps, measured now")
         end_with_plan(f"{plan.text}, {time}", as_json)
     with runs.making(database, plan.kind, plan.folder) as run:
         yield plan.make(lambda title: progress_bar(title, run))

@@ -14,15 +14,15 @@ class TargetPart(Part):
     """A family of targets. It decorates the function (folder, description, device, dtype) that loads a target.
 
     Args:
-        importer: Function that makes a target of this family from the settings of `kerv build target`. None if
-            targets of this family are made only by training.
+        importer: Function (settings, folder) that writes a target of this family into an empty folder, for `kerv build
+            target`. It returns numbers to print, by name. None if such targets are made only by training.
         check_weights: Function (folder, description) that checks weights stored outside the target's folder. None if
             the weights are in the target's folder.
         images_alone: Whether targets of this family read only images, and no proprioception or state.
     """
 
     kind = "target"
-    importer: Callable[[Any], Any] | None = None
+    importer: Callable[[Any, Any], Any] | None = None
     check_weights: Callable[[Any, Any], None] | None = None
     images_alone: bool = False
 
@@ -34,10 +34,10 @@ def compact(*arguments: Any) -> Any:
     return build(*arguments)
 
 
-def _grow(settings: Any) -> Any:
+def _grow(*arguments: Any) -> Any:
     from kerv_cli.targets.grown import grow
 
-    return grow(settings)
+    return grow(*arguments)
 
 
 def _check_grown(*arguments: Any) -> None:
@@ -53,10 +53,10 @@ def grown(*arguments: Any) -> Any:
     return build(*arguments)
 
 
-def _import_openvla(settings: Any) -> Any:
+def _import_openvla(*arguments: Any) -> Any:
     from kerv_cli.targets.openvla.target import import_checkpoint
 
-    return import_checkpoint(settings)
+    return import_checkpoint(*arguments)
 
 
 def _check_openvla(*arguments: Any) -> None:

@@ -5,15 +5,13 @@ The description contains settings, action and observation space, vocabulary and 
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.files import read_mapping, sha256_of, write_bytes, write_folder, write_json
+from kerv_cli.base.files import link_files, read_mapping, sha256_of, write_bytes, write_folder, write_json
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.targets import TargetPart
@@ -181,20 +179,13 @@ def save_module(
 
     def fill(new: Path) -> None:
         if folder.exists():
-            shutil.copytree(folder, new, symlinks=True, copy_function=_linked, dirs_exist_ok=True)
+            link_files(folder, new)
         save_tensors(new / WEIGHTS, compact(module.state_dict(), stored))
         digest = sha256_of(new / WEIGHTS)
         write_json(new / f"{kind}.json", {"format": FORMAT, "kind": kind, "sha256": digest, **description})
 
     write_folder(folder, fill)
     return sha256_of(folder / WEIGHTS)
-
-
-def _linked(source: str, new: str) -> None:
-    try:
-        os.link(source, new)
-    except OSError:
-        shutil.copy2(source, new)
 
 
 def target_fields(

@@ -23,7 +23,7 @@ from torch import nn
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import write_json
 from kerv_cli.base.manifests import read
-from kerv_cli.base.paths import artifact, find_target
+from kerv_cli.base.paths import find_target
 from kerv_cli.targets import checkpoint
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.compact.program import compile_parts
@@ -136,8 +136,8 @@ def _grow(target: CompactTarget, shape: GrowSettings) -> None:
     target.trunk.padding = max(0, shape.prompt - target.max_prompt)
 
 
-def grow(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
-    """Make a grown target by writing its recipe. Return its folder, and numbers to print by name."""
+def grow(settings: BuildTargetSettings, folder: Path) -> dict[str, Any]:
+    """Write a grown target's recipe, for `kerv build target grow=SHAPE`. Return numbers to print, by name."""
     base = find_target(settings.results, settings.base).resolve()
     description = checkpoint.read_target(base)
     if description.family != "compact":
@@ -150,7 +150,6 @@ def grow(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
         del identity["prompt"]  # targets that were grown before this setting existed keep their hash
     digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
     grown = {**description.settings, "grown": asdict(recipe)}
-    folder = artifact(settings.results, "target", settings.name)
     write_json(folder / "target.json", asdict(replace(description, family="grown", settings=grown, sha256=digest)))
     weights = sum(p.numel() for p in target.trunk.layers.parameters() if p.dim() == 2)
-    return folder, {"weights": weights, "those of the policy": description.provenance.get("parameters", 0)}
+    return {"weights": weights, "those of the policy": description.provenance.get("parameters", 0)}

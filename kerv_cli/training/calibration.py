@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -53,9 +54,68 @@ LOW, HIGH = 2.0, 1 / 3
 RATIOS = np.logspace(-3, 3, 49)
 
 
-def plan_calibration(
-    settings: CalibrateSettings, database: Database
-) -> Plan[tuple[Path, stored.Calibration, list[str]]]:
+Calibrated = tuple[Path, stored.Calibration, list[str]]  # its file, and a line per section that was not measured
+
+
+@dataclass(frozen=True)
+class CalibrationWork:
+    """A calibration whose settings are checked."""
+
+    settings: CalibrateSettings
+    artifacts: Artifacts
+    dataset: DemoDataset
+    chosen: list[int]  # episodes
+    tasks: tuple[str, ...]
+    missing: list[str]  # kinds of artifacts without which sections are left out
+    path: Path
+    old: stored.Calibration | None  # the calibration to complete
+
+    def __call__(self, stage: Stage) -> Calibrated:
+        """Measure the sections, and write them to one JSON file."""
+        settings, dataset, target = self.settings, self.dataset, self.artifacts.description
+        with stage("reading demonstrations") as progress:
+            past, future, paths, counts = read_windows(
+                dataset, self.chosen, target.actions, settings.window, target.chunk, progress
+            )
+        variability, skip = self.variability(stage), self.skip(stage)
+        with stage("boundary ranges") as progress:
+            boundary = fit_boundary(paths, settings.boundary_windows, self.old, progress)
+        with stage("fitting the predictors"):
+            noise = fit_filters(past, future)
+        calibration = stored.Calibration(
+            target=MadeFor.of(target),
+            demos=stored.Demonstrations(dataset.sha256, counts),
+            window=settings.window,
+            noise=noise,
+            variability=variability,
+            boundary=boundary,
+            skip=skip,
+            provenance=provenance_of("kerv calibrate", settings, self.artifacts.device),
+        )
+        if self.old is not None:
+            calibration = completed(self.old, calibration)
+        write_json(self.path, stamped(asdict(calibration)))
+        no_drafter = ", no drafter" if "drafter" in self.missing else ""
+        notes = [] if variability else [f"no reference levels K_S: decodes={settings.decodes}{no_drafter}"]
+        notes += [] if skip else ["no skip levels: no datastore of these tasks (kerv build datastore)"]
+        return self.path, calibration, notes
+
+    def variability(self, stage: Stage) -> dict[str, stored.Variability]:
+        if not self.settings.decodes or "drafter" in self.missing:
+            return {}
+        decoder = drafting().decoder(self.artifacts.target, self.artifacts.load)
+        with stage("pre-sampling") as progress:
+            return presample(decoder, self.dataset, self.chosen, self.tasks, self.settings.decodes, progress)
+
+    def skip(self, stage: Stage) -> stored.SkipSection | None:
+        if "datastore" in self.missing:
+            return None
+        store, settings = self.artifacts.load("datastore"), self.settings
+        with stage("skip levels") as progress:
+            return skip_section(store, self.tasks, settings.epsilon, settings.confidence, progress)
+
+
+def plan_calibration(settings: CalibrateSettings, database: Database) -> Plan[Calibrated]:
     """Check what a calibration is measured on. The work measures its sections and writes them to one JSON file.
 
     It returns the file's path, the calibration, and a line per section that was not measured: no K_S if `decodes` is 0
@@ -68,65 +128,25 @@ def plan_calibration(
     settings, dataset = demos_for(settings, target, database)
     tasks = resolve_tasks(settings.task or list(dataset.manifest.tasks))
     chosen = choose_episodes(dataset, tasks, settings.episodes)
-    method = Method.of(RolloutSettings(**{kind: find(kind, name).default for kind, name in DRAFTS.items()}))
-    method.check(target)
+    drafting().check(target)
     missing = [kind for kind in ("drafter", "datastore") if not artifacts.exists(kind)]
     artifacts.check({"datastore"} - set(missing))
     path = artifacts.new("calibration", adds=settings.complete)
-
-    def check() -> bool:
-        if not settings.complete:
-            check_free(path, "policy.artifacts.calibration", settings.replace)
-        return settings.complete
-
+    check = partial(check_free, path, "policy.artifacts.calibration", settings.replace or settings.complete)
     check()
     old: stored.Calibration | None = artifacts.load("calibration") if settings.complete else None
     without = f"; without {' and '.join(missing)}" if missing else ""
-    plan = (
-        f"predictors fitted on {count(len(chosen), 'demonstration')} of {count(len(tasks), 'task')}; "
+    text = (
+        f"{path}: predictors fitted on {count(len(chosen), 'demonstration')} of {count(len(tasks), 'task')}; "
         f"{settings.decodes} decodes per task; boundary over {', '.join(map(str, settings.boundary_windows))} "
         f"positions{without}"
     )
+    work = CalibrationWork(settings, artifacts, dataset, chosen, tasks, missing, path, old)
+    return Plan("calibration", path, text, work, check)
 
-    def work(stage: Stage) -> tuple[Path, stored.Calibration, list[str]]:
-        decoder = skip = None
-        if settings.decodes and "drafter" not in missing:
-            decoder = method.decoder(artifacts.target, artifacts.load)
-        store = None if "datastore" in missing else artifacts.load("datastore")
-        with stage("reading demonstrations") as progress:
-            past, future, paths, counts = read_windows(
-                dataset, chosen, target.actions, settings.window, target.chunk, progress
-            )
-        variability: dict[str, stored.Variability] = {}
-        if decoder:
-            with stage("pre-sampling") as progress:
-                variability = presample(decoder, dataset, chosen, tasks, settings.decodes, progress)
-        if store:
-            with stage("skip levels") as progress:
-                skip = skip_section(store, tasks, settings.epsilon, settings.confidence, progress)
-        with stage("boundary ranges") as progress:
-            boundary = fit_boundary(paths, settings.boundary_windows, old, progress)
-        with stage("fitting the predictors"):
-            noise = fit_filters(past, future)
-        calibration = stored.Calibration(
-            target=MadeFor.of(target),
-            demos=stored.Demonstrations(dataset.sha256, counts),
-            window=settings.window,
-            noise=noise,
-            variability=variability,
-            boundary=boundary,
-            skip=skip,
-            provenance=provenance_of("kerv calibrate", settings, device),
-        )
-        if old is not None:
-            calibration = completed(old, calibration)
-        write_json(path, stamped(asdict(calibration)))
-        no_drafter = ", no drafter" if "drafter" in missing else ""
-        notes = [] if decoder else [f"no reference levels K_S: decodes={settings.decodes}{no_drafter}"]
-        notes += [] if skip else ["no skip levels: no datastore of these tasks (kerv build datastore)"]
-        return path, calibration, notes
 
-    return Plan("calibration", path, f"{path}: {plan}", work, check)
+def drafting() -> Method:
+    return Method.of(RolloutSettings(**{kind: find(kind, name).default for kind, name in DRAFTS.items()}))
 
 
 def presample(

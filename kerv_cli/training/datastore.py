@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +29,63 @@ from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.training.settings import BuildDatastoreSettings, Plan, Stage
 from kerv_cli.worlds import resolve_tasks
+from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.files import DemoEpisode
 
 BATCH = 128  # maximum number of observations that are encoded together
+
+
+@dataclass(frozen=True)
+class DatastoreWork:
+    """A datastore whose settings are checked."""
+
+    settings: BuildDatastoreSettings
+    artifacts: Artifacts
+    dataset: DemoDataset
+    chosen: dict[str, list[int]]  # episodes of each task, in the order of their seeds
+    folder: Path
+
+    def seeds(self, task: str) -> list[int]:
+        return [self.dataset.episodes[index].seed for index in self.chosen[task]]
+
+    def __call__(self, stage: Stage) -> tuple[Path, stored.Datastore]:
+        """Encode the demonstrations, and write the datastore."""
+        parts: list[dict[str, np.ndarray]] = []
+        shards: dict[str, stored.Shard] = {}
+        rows, number = 0, sum(map(len, self.chosen.values()))
+        with stage("encoding demonstrations") as progress:
+            for task, indices in self.chosen.items():
+                first = rows
+                for index in indices:
+                    episode, space = self.dataset.load(index), self.dataset.manifest.observation
+                    parts.append(entries_of(self.artifacts.target, episode, space, self.settings.key))
+                    rows += len(parts[-1]["step"])
+                    progress(len(parts), number)
+                shards[task] = stored.Shard((first, rows), tuple(self.seeds(task)))
+        write_folder(self.folder, lambda new: self.write(new, parts, shards, rows))
+        return self.folder, stored.Datastore.open(self.folder, self.artifacts.description)
+
+    def write(
+        self, new: Path, parts: Sequence[Mapping[str, np.ndarray]], shards: dict[str, stored.Shard], rows: int
+    ) -> None:
+        settings, target = self.settings, self.artifacts.description
+        width = write_files(new, parts, settings)
+        files = [name for name in (stored.PROJECTION, stored.VECTORS, stored.PAYLOAD) if (new / name).exists()]
+        manifest = stored.Manifest(
+            format=2,
+            kind="datastore",
+            key=tuple(settings.key),
+            width=width,
+            rows=rows,
+            chunk=target.chunk,
+            actions=target.actions,
+            target=target.sha256,
+            demos=self.dataset.sha256,
+            files={name: sha256_of(new / name) for name in files},
+            tasks=shards,
+            provenance=provenance_of("kerv build datastore", settings, self.artifacts.device),
+        )
+        write_json(new / stored.MANIFEST, stamped(asdict(manifest)))
 
 
 def plan_datastore(settings: BuildDatastoreSettings, database: Database) -> Plan[tuple[Path, stored.Datastore]]:
@@ -40,66 +95,22 @@ def plan_datastore(settings: BuildDatastoreSettings, database: Database) -> Plan
     device, _ = set_up(settings.runtime)
     artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
     settings, dataset = demos_for(settings, artifacts.description, database)
-    tasks = sorted(resolve_tasks(settings.task or list(dataset.manifest.tasks)))
     folder = artifacts.new("datastore")
-
-    def check() -> bool:
-        check_free(folder, "policy.artifacts.datastore", settings.replace)
-        return False
-
+    check = partial(check_free, folder, "policy.artifacts.datastore", settings.replace)
     check()
-    chosen: dict[str, list[int]] = {}
-    seeds: dict[str, list[int]] = {}
-    number = steps = 0
-    for task in tasks:
+    chosen = {}
+    for task in sorted(resolve_tasks(settings.task or list(dataset.manifest.tasks))):
         by_seed = sorted(dataset.of_tasks(task), key=lambda index: dataset.episodes[index].seed)
         chosen[task] = by_seed[: settings.episodes or None]
-        episodes = [dataset.episodes[index] for index in chosen[task]]
-        seeds[task] = [episode.seed for episode in episodes]
-        number, steps = number + len(episodes), steps + sum(episode.steps for episode in episodes)
-    stored.check_seeds(seeds, dataset.path)
-    plan = (
-        f"{count(number, 'demonstration')} of {count(len(tasks), 'task')}, {steps} control steps, through "
-        f"{artifacts.folder}, keys from {' + '.join(settings.key)}"
+    work = DatastoreWork(settings, artifacts, dataset, chosen, folder)
+    stored.check_seeds({task: work.seeds(task) for task in chosen}, dataset.path)
+    episodes = [dataset.episodes[index] for indices in chosen.values() for index in indices]
+    text = (
+        f"{folder}: {count(len(episodes), 'demonstration')} of {count(len(chosen), 'task')}, "
+        f"{sum(episode.steps for episode in episodes)} control steps, through {artifacts.folder}, keys from "
+        f"{' + '.join(settings.key)}"
     )
-
-    def work(stage: Stage) -> tuple[Path, stored.Datastore]:
-        parts: list[dict[str, np.ndarray]] = []
-        shards: dict[str, stored.Shard] = {}
-        rows, target = 0, artifacts.description
-        with stage("encoding demonstrations") as progress:
-            for name, indices in chosen.items():
-                first = rows
-                for index in indices:
-                    episode, space = dataset.load(index), dataset.manifest.observation
-                    parts.append(entries_of(artifacts.target, episode, space, settings.key))
-                    rows += len(parts[-1]["step"])
-                    progress(len(parts), number)
-                shards[name] = stored.Shard((first, rows), tuple(seeds[name]))
-
-        def write(new: Path) -> None:
-            width = write_files(new, parts, settings)
-            files = [name for name in (stored.PROJECTION, stored.VECTORS, stored.PAYLOAD) if (new / name).exists()]
-            manifest = stored.Manifest(
-                format=2,
-                kind="datastore",
-                key=tuple(settings.key),
-                width=width,
-                rows=rows,
-                chunk=target.chunk,
-                actions=target.actions,
-                target=target.sha256,
-                demos=dataset.sha256,
-                files={name: sha256_of(new / name) for name in files},
-                tasks=shards,
-                provenance=provenance_of("kerv build datastore", settings, device),
-            )
-            write_json(new / stored.MANIFEST, stamped(asdict(manifest)))
-
-        write_folder(folder, write)
-        return folder, stored.Datastore.open(folder, target)
-
-    return Plan("datastore", folder, f"{folder}: {plan}", work, check)
+    return Plan("datastore", folder, text, work, check)
 
 
 @torch.inference_mode()

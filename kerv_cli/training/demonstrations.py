@@ -228,11 +228,10 @@ def plan_demos(settings: DemosSettings) -> Plan[tuple[Path, DemoManifest]]:
     config.spec.check_installed()
     folder = artifact(settings.results, "demos", settings.name or name_of(settings.task))
 
-    def check() -> bool:
+    def check() -> None:
         if folder.is_dir() and visible(folder) and not (folder / "recording.json").is_file():
             raise UsageError(f"{folder} holds other demonstrations: choose another name=; demos=A+B joins both")
         check_recording(config, folder)
-        return True
 
     def work(stage: Stage) -> tuple[Path, DemoManifest]:
         with stage("demonstrations") as advance:

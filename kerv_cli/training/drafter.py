@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
+from kerv_cli.base.files import write_folder
 from kerv_cli.base.paths import check_free
 from kerv_cli.base.registry import ProposerPart, find
 from kerv_cli.base.runtime import set_up
+from kerv_cli.engine.decoder import Stopwatch
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import command_to_go_on
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
@@ -22,9 +24,86 @@ from kerv_cli.methods.eagle.public import Convention, read_public
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_tasks, demos_for
-from kerv_cli.training.fit import Metrics, batches, figures_of, fit, identity_of, resumes, without_subnormals
+from kerv_cli.training.fit import (
+    Destination,
+    Loss,
+    Metrics,
+    batches,
+    figures_of,
+    fit,
+    identity_of,
+    seconds_of,
+    without_subnormals,
+)
 from kerv_cli.training.settings import BuildDrafterSettings, Plan, Stage, TrainDrafterSettings
 from kerv_cli.worlds import resolve_tasks
+from kerv_cli.worlds.demos.dataset import DemoDataset
+
+FEW = 4  # episodes on which `--plan` measures the time of decodes and steps
+SAMPLES = 64  # decodes of which it measures the time
+
+
+@dataclass(frozen=True)
+class DrafterTraining:
+    """A training of a drafter whose settings are checked."""
+
+    settings: TrainDrafterSettings
+    drafter: TrainableDrafter
+    artifacts: Artifacts
+    dataset: DemoDataset
+    place: Destination
+
+    def work(self, stage: Stage) -> tuple[Path, Metrics]:
+        drafter, settings, train = self.drafter, self.settings, self.settings.train
+        provenance = provenance_of("kerv train drafter", settings, set_up(settings.runtime)[0])
+        made_for, shape = MadeFor.of(self.artifacts.description), asdict(settings.drafter)
+        with self.place.opened() as folder, without_subnormals():
+            with stage("the target's greedy decodes") as progress:
+                target = self.target()
+                examples, held_out = drafter.examples(target, self.dataset, settings.drafter, train.held_out, progress)
+            network, loss = self.network(target, examples)
+
+            @torch.no_grad()
+            def validate(network: Any) -> Metrics:
+                return drafter.validate(network, target, held_out, settings)
+
+            def save(network: Any, metrics: Metrics) -> None:
+                made = provenance | figures_of(self.dataset, network, metrics)
+                drafter.save(folder, network, made_for, made, train.stored, settings=shape)
+
+            with stage("training the drafter") as progress:
+                metrics = fit(network, loss, validate, save, train, folder, self.place.identity, progress)
+        return self.place.folder, metrics
+
+    def seconds(self) -> float:
+        """Measure a few decodes and steps on a few demonstrations, and estimate the time of all."""
+        drafter, dataset, held_out = self.drafter, self.dataset, self.settings.train.held_out
+        few, target, own = replace(dataset, episodes=dataset.episodes[:FEW]), self.target(), self.settings.drafter
+        stride = int(dataset.manifest.config["frame_stride"]) if target.cameras else 1  # control steps per observation
+        sample, decodes = own, sum(episode.steps for episode in dataset.episodes) // stride
+        if hasattr(own, "samples"):
+            sample, decodes = replace(own, samples=min(own.samples, SAMPLES)), min(own.samples, decodes)
+        times = []
+        for _ in range(2):  # the first time includes compiling
+            clock = Stopwatch(target.device)
+            examples, rest = drafter.examples(target, few, sample, held_out, lambda done, total: None)
+            times.append(clock.stop())
+        of_decodes = min(times) * decodes / (len(examples) + len(rest))
+        _, loss = self.network(target, examples)
+        return of_decodes + seconds_of(loss, self.settings.train, target.device)
+
+    def target(self) -> Any:
+        device, dtype = set_up(self.settings.runtime)
+        return load_target(self.artifacts.folder, device, dtype)[0]
+
+    def network(self, target: Any, examples: Any) -> tuple[Any, Loss]:
+        train = self.settings.train
+        torch.manual_seed(train.seed)
+        network: Any = self.drafter.network(self.settings.drafter, target)
+        self.drafter.prepare(network, examples)
+        network.to(target.device)
+        draw = batches(len(examples), train)
+        return network, lambda step: self.drafter.loss(network, target, examples.where(draw(step)), step, self.settings)
 
 
 def plan_drafter(settings: TrainDrafterSettings, database: Database) -> Plan[tuple[Path, Metrics]]:
@@ -48,46 +127,14 @@ def plan_drafter(settings: TrainDrafterSettings, database: Database) -> Plan[tup
     imitated = {"drafter": shape, "target": description.sha256, "task": list(tasks)}
     if settings.runtime.dtype != "float32":  # left out, so that trainings from before it counted can be resumed
         imitated["dtype"] = settings.runtime.dtype
-    identity = identity_of(train, dataset, **imitated)
-
-    begun = bool(command_to_go_on(database, drafter.kind, folder))
-
-    def check() -> bool:
-        return resumes(folder, identity, f"policy.artifacts.{drafter.kind}", settings.replace, begun)
-
-    check()
+    identity, begun = identity_of(train, dataset, **imitated), bool(command_to_go_on(database, drafter.kind, folder))
+    place = Destination(folder, identity, train.steps, f"policy.artifacts.{drafter.kind}", settings.replace, begun)
+    place.check()
     layers = f"{shape['layers']}-layer " if "layers" in shape else ""
     samples = f", greedy decodes of {shape['samples']} observations" if "samples" in shape else ""
-    plan = f"{layers}{drafter.noun} of {artifacts.folder}{samples}, {train.steps} steps of {train.batch}"
-
-    def work(stage: Stage) -> tuple[Path, Metrics]:
-        device, dtype = set_up(settings.runtime)
-        provenance = provenance_of("kerv train drafter", settings, device)
-        with without_subnormals():
-            with stage("the target's greedy decodes") as progress:
-                target: Any = load_target(artifacts.folder, device, dtype)[0]
-                examples, held_out = drafter.examples(target, dataset, settings.drafter, train.held_out, progress)
-            torch.manual_seed(train.seed)
-            network: Any = drafter.network(settings.drafter, target)
-            drafter.prepare(network, examples)
-            network.to(target.device)
-            draw = batches(len(examples), train)
-
-            def loss(step: int) -> tuple[Tensor, Metrics]:
-                return drafter.loss(network, target, examples.where(draw(step)), step, settings)
-
-            @torch.no_grad()
-            def validate(network: Any) -> Metrics:
-                return drafter.validate(network, target, held_out, settings)
-
-            def save(network: Any, metrics: Metrics) -> None:
-                made = provenance | figures_of(dataset, network, metrics)
-                drafter.save(folder, network, MadeFor.of(description), made, train.stored, settings=shape)
-
-            with stage("training the drafter") as progress:
-                return folder, fit(network, loss, validate, save, train, folder, identity, progress)
-
-    return Plan(drafter.kind, folder, f"{folder}: {plan}", work, check, train.steps)
+    text = f"{folder}: {layers}{drafter.noun} of {artifacts.folder}{samples}, {train.steps} steps of {train.batch}"
+    training = DrafterTraining(settings, drafter, artifacts, dataset, place)
+    return Plan(drafter.kind, folder, text, training.work, place.check, train.steps, training.seconds)
 
 
 def plan_import(settings: BuildDrafterSettings) -> Plan[tuple[Path, dict[str, Any]]]:
@@ -97,10 +144,7 @@ def plan_import(settings: BuildDrafterSettings) -> Plan[tuple[Path, dict[str, An
     artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
     folder = artifacts.new(EagleDrafter.kind)
 
-    def check() -> bool:
-        check_free(folder, "policy.artifacts.drafter", settings.replace)
-        return False
-
+    check = partial(check_free, folder, "policy.artifacts.drafter", settings.replace)
     check()
     network = read_public(Path(settings.checkpoint).expanduser(), artifacts.target, convention)
     layers = network.shape.language.num_hidden_layers
@@ -110,7 +154,8 @@ def plan_import(settings: BuildDrafterSettings) -> Plan[tuple[Path, dict[str, An
     made_for = MadeFor.of(artifacts.description)
 
     def work(stage: Stage) -> tuple[Path, dict[str, Any]]:
-        EagleDrafter().save(folder, network, made_for, provenance, settings=shapes, public=asdict(network.shape))
+        more: dict[str, Any] = {"settings": shapes, "public": asdict(network.shape)}
+        write_folder(folder, lambda new: EagleDrafter().save(new, network, made_for, provenance, **more))
         return folder, {**figures, "layers": layers, **asdict(convention)}
 
     return Plan(EagleDrafter.kind, folder, str(folder), work, check)

@@ -16,7 +16,7 @@ import time
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -25,8 +25,9 @@ import torch
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError, Interrupted, KervError, UsageError
-from kerv_cli.base.files import write_bytes, write_if_changed
+from kerv_cli.base.files import link_files, remove, unfinished, visible, write_bytes, write_folder, write_if_changed
 from kerv_cli.base.paths import RESUME, check_free
+from kerv_cli.engine.decoder import Stopwatch
 from kerv_cli.episodes.identity import hash_of
 from kerv_cli.training.settings import TrainSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset
@@ -245,20 +246,68 @@ def identity_of(train: TrainSettings, dataset: DemoDataset, **own: Any) -> str:
     return hash_of({"train": counted, "demos": dataset.sha256, **own})
 
 
-def resumes(folder: Path, identity: str, setting: str, replace: bool, begun: bool) -> bool:
-    """Return whether the folder holds this training, to go on with. Refuse what else it holds, unless `replace`."""
-    try:
-        stored = torch.load(folder / RESUME, "cpu", mmap=True, weights_only=True)["identity"]
-    except FileNotFoundError:
-        check_free(folder, setting, replace or begun)
-        return False
-    except _UNREADABLE:
-        return not replace  # reading the state then says what is damaged
-    if stored != identity and not replace:
-        raise UsageError(
-            f"{folder} holds a run with other settings or data: choose another {setting}=NAME, or type replace=true"
-        )
-    return bool(stored == identity and (begun or not replace))
+@dataclass(frozen=True)
+class Destination:
+    """Where a training is made: in its folder, or beside the weights there, which it replaces once it is complete."""
+
+    folder: Path
+    identity: str
+    steps: int
+    setting: str  # chooses another name, for error messages
+    replace: bool
+    begun: bool  # whether the newest command that made something in this folder did not complete
+
+    def check(self) -> None:
+        """Refuse to replace what the folder holds, unless `replace=true` was typed."""
+        stored = self._stored(self.folder)
+        if stored is None:
+            check_free(self.folder, self.setting, self.replace or self.begun)
+        elif not self.replace and stored[0] not in ("", self.identity):
+            raise UsageError(
+                f"{self.folder} holds a run with other settings or data: choose another {self.setting}=NAME, "
+                "or type replace=true"
+            )
+
+    @contextmanager
+    def opened(self) -> Iterator[Path]:
+        """Yield the folder to train in. If it is not `self.folder`, it replaces that one after the block."""
+        new = unfinished(self.folder)
+        in_place = not visible(self.folder) or (self.begun and self._resumes(self.folder))
+        if not self.replace or (in_place and not new.exists()):
+            yield self.folder
+            return
+        if not self._resumes(new):
+            remove(new)
+        new.mkdir(exist_ok=True)
+        yield new
+        write_folder(self.folder.resolve(), lambda temporary: link_files(new, temporary))
+        remove(new)
+
+    def _resumes(self, folder: Path) -> bool:
+        stored = self._stored(folder)
+        return stored is not None and stored[0] == self.identity and stored[1] <= self.steps
+
+    @staticmethod
+    def _stored(folder: Path) -> tuple[str, int] | None:
+        """Return identity and step in a folder's resume file. None without one; ("", 0) if it cannot be read."""
+        try:
+            state = torch.load(folder / RESUME, "cpu", mmap=True, weights_only=True)
+            return state["identity"], state["step"]
+        except FileNotFoundError:
+            return None
+        except _UNREADABLE:
+            return "", 0  # without replace=true, reading the whole state says what is damaged
+
+
+def seconds_of(loss: Loss, settings: TrainSettings, device: torch.device) -> float:
+    """Estimate how long all steps of a training take, from three of them. The first one counts as warm-up."""
+    times = []
+    with without_subnormals():
+        for step in range(settings.scene_steps, settings.scene_steps + 3):
+            clock = Stopwatch(device)
+            loss(step)[0].backward()
+            times.append(clock.stop())
+    return settings.steps * min(times[1:])
 
 
 def read_state(path: Path) -> dict[str, Any]:

@@ -41,8 +41,7 @@ class Plan(Generic[T]):
         path: Its folder; for a calibration its file.
         text: What would be made, for `--plan`.
         work: Function that makes the artifact, and shows its stages.
-        check: Called again before the work. It refuses to replace what is there, or returns whether the work goes on
-            with it.
+        check: Called again before the work. It refuses to replace what is there.
         units: Number of optimisation steps or episodes. 0 if unknown.
         seconds: Measures how long the work takes, for `--plan` on a machine that has done nothing like it.
     """
@@ -51,7 +50,7 @@ class Plan(Generic[T]):
     path: Path
     text: str
     work: Callable[[Stage], T]
-    check: Callable[[], bool]
+    check: Callable[[], object]
     units: int = 0
     seconds: Callable[[], float] | None = None
 

@@ -26,7 +26,6 @@ from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.paths import find_target, new_target
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.spaces import ActionSpace, Place
-from kerv_cli.engine.decoder import Stopwatch
 from kerv_cli.episodes.runner import success_of
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import command_to_go_on
@@ -38,11 +37,22 @@ from kerv_cli.targets.observations import Observations, read_chunks, read_observ
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.training.demonstrations import check_spaces, check_tasks, name_of, open_demos, seen_by
-from kerv_cli.training.fit import Metrics, batches, figures_of, fit, identity_of, resumes, without_subnormals
+from kerv_cli.training.fit import (
+    Destination,
+    Loss,
+    Metrics,
+    batches,
+    figures_of,
+    fit,
+    identity_of,
+    seconds_of,
+    without_subnormals,
+)
 from kerv_cli.training.settings import Plan, Stage, TrainSettings, TrainTargetSettings, refuse_unused
 from kerv_cli.worlds import resolve_tasks, settled, spec_of, specs
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.files import DemoEpisode
+from kerv_cli.worlds.settings import WorldSettings
 
 STATE_EPISODES = 200  # maximum number of episodes from which the range of the states is measured
 # Validation reports the share of tokens at most this many bins from the label. It is Spec-VLA's acceptance radius.
@@ -52,6 +62,54 @@ WITHIN = 9
 WAYPOINTS = (Place("waypoint 1", 0), Place("waypoint 2", 0))
 FEW = 4  # episodes on which `--plan` measures the time of a step
 VALIDATED = 2048  # maximum number of samples in a validation
+
+
+@dataclass(frozen=True)
+class TargetTraining:
+    """A training of a compact policy whose settings are checked."""
+
+    settings: TrainTargetSettings
+    dataset: DemoDataset
+    tasks: tuple[str, ...]
+    world: WorldSettings
+    init: Path | None  # folder of the target whose weights it starts from
+    place: Destination
+
+    def work(self, stage: Stage) -> tuple[Path, Metrics]:
+        dataset, train = self.dataset, self.settings.train
+        provenance = provenance_of("kerv train target", self.settings, set_up(self.settings.runtime)[0])
+        provenance |= origin_of(self.init)
+        with self.place.opened() as folder, without_subnormals():
+            with stage("reading demonstrations") as progress:
+                target, imitation, loss = self.loaded(dataset, self.tasks, progress)
+            states = functools.cache(lambda: state_range(dataset))
+
+            def save(target: CompactTarget, metrics: Metrics) -> None:
+                made = provenance | figures_of(dataset, target, metrics)
+                save_target(folder, target, dataset.manifest.environment, made, train.stored, states())
+
+            with stage("training the target") as progress:
+                metrics = fit(target, loss, imitation.validate, save, train, folder, self.place.identity, progress)
+        return self.place.folder, metrics
+
+    def seconds(self) -> float:
+        """Measure a few steps on demonstrations of one task, and estimate the time of all steps."""
+        dataset, tasks = self.dataset, self.tasks[:1]
+        few = replace(dataset, episodes=[dataset.episodes[index] for index in dataset.of_tasks(*tasks)[:FEW]])
+        target, _, loss = self.loaded(few, tasks, lambda done, total: None)
+        return seconds_of(loss, self.settings.train, target.device)
+
+    def loaded(
+        self, dataset: DemoDataset, tasks: tuple[str, ...], progress: OnProgress
+    ) -> tuple[CompactTarget, Imitation, Loss]:
+        """Make the network, and read its samples from demonstrations."""
+        train, (device, _) = self.settings.train, set_up(self.settings.runtime)
+        target, samples = load_training(self.settings, dataset, tasks, self.init, self.world.camera.name, progress)
+        seeds = spec_of(tasks[0]).seeds.selection[: train.closed_loop]
+        success = functools.partial(success_of, tasks=tasks, seeds=seeds, settings=self.world) if seeds else None
+        imitation = Imitation(target.to(device), samples, train, success)
+        draw = batches(len(imitation.training), train, imitation.weights)
+        return target, imitation, lambda step: imitation.loss(draw(step), step)
 
 
 def plan_target(settings: TrainTargetSettings, database: Database) -> Plan[tuple[Path, Metrics]]:
@@ -66,70 +124,40 @@ def plan_target(settings: TrainTargetSettings, database: Database) -> Plan[tuple
     settings.task = settings.task or list(dataset.manifest.tasks)
     tasks = resolve_tasks(settings.task)
     settle_places(settings, dataset)
-    spec = spec_of(tasks[0])
     world = settled(settings.world, tasks)
     init = initial_target(settings, world.camera.name, folder)
-    check_spaces(dataset, spec.actions, spec.observation, f"the tasks' environment {spec.name}")
-    check_tasks(dataset, tasks)
-    if settings.target.observation == "vision":
-        remedy = "set world.camera.name, or record again"
-        dataset = seen_by(dataset, world.camera.name, "the policy would be shown", remedy)
-    origin = {"init": read_target(init).sha256} if init else {}
+    dataset = checked_demos(settings, dataset, tasks, world.camera.name)
     shapes = asdict(settings.target)
     if settings.target.code == "bins":  # left out, so that trainings from before there were codes can be resumed
         del shapes["code"]
-    identity = identity_of(train, dataset, target=shapes, tasks=tasks, views=dataset.views, **origin)
-
+    identity = identity_of(train, dataset, target=shapes, tasks=tasks, views=dataset.views, **origin_of(init))
     begun = bool(command_to_go_on(database, "target", folder))
-
-    def check() -> bool:
-        return resumes(folder, identity, "name", settings.replace, begun)
-
-    check()
-    episodes = len(dataset.of_tasks(*tasks))
+    place = Destination(folder, identity, train.steps, "name", settings.replace, begun)
+    place.check()
     start = f", starting from {init}" if init else ""
-    plan = (
-        f"{settings.target.size} on {settings.target.observation}, {count(episodes, 'demonstration')} of "
-        f"{count(len(tasks), 'task')}, {count(train.steps, 'step')} of {train.batch} samples{start}"
+    text = (
+        f"{folder}: {settings.target.size} on {settings.target.observation}, "
+        f"{count(len(dataset.of_tasks(*tasks)), 'demonstration')} of {count(len(tasks), 'task')}, "
+        f"{count(train.steps, 'step')} of {train.batch} samples{start}"
     )
+    training = TargetTraining(settings, dataset, tasks, world, init, place)
+    return Plan("target", folder, text, training.work, place.check, train.steps, training.seconds)
 
-    def work(stage: Stage) -> tuple[Path, Metrics]:
-        device, _ = set_up(settings.runtime)
-        provenance = provenance_of("kerv train target", settings, device) | origin
-        with without_subnormals():
-            with stage("reading demonstrations") as progress:
-                target, samples = load_training(settings, dataset, tasks, init, world.camera.name, progress)
-            seeds = spec.seeds.selection[: train.closed_loop]
-            success = functools.partial(success_of, tasks=tasks, seeds=seeds, settings=world) if seeds else None
-            imitation = Imitation(target.to(device), samples, train, success)
-            draw = batches(len(imitation.training), train, imitation.weights)
-            states = functools.cache(lambda: state_range(dataset))
 
-            def loss(step: int) -> tuple[Tensor, Metrics]:
-                return imitation.loss(draw(step), step)
+def checked_demos(
+    settings: TrainTargetSettings, dataset: DemoDataset, tasks: tuple[str, ...], camera: str
+) -> DemoDataset:
+    """Check that demonstrations are of these tasks and show what the policy will see. Return those views of them."""
+    spec = spec_of(tasks[0])
+    check_spaces(dataset, spec.actions, spec.observation, f"the tasks' environment {spec.name}")
+    check_tasks(dataset, tasks)
+    if settings.target.observation != "vision":
+        return dataset
+    return seen_by(dataset, camera, "the policy would be shown", "set world.camera.name, or record again")
 
-            def save(target: CompactTarget, metrics: Metrics) -> None:
-                made = provenance | figures_of(dataset, target, metrics)
-                save_target(folder, target, dataset.manifest.environment, made, train.stored, states())
 
-            with stage("training the target") as progress:
-                return folder, fit(target, loss, imitation.validate, save, train, folder, identity, progress)
-
-    def seconds() -> float:
-        device, _ = set_up(settings.runtime)
-        few = replace(dataset, episodes=[dataset.episodes[index] for index in dataset.of_tasks(tasks[0])[:FEW]])
-        target, samples = load_training(settings, few, tasks[:1], init, world.camera.name, lambda done, total: None)
-        imitation = Imitation(target.to(device), samples, train)
-        draw = batches(len(imitation.training), train, imitation.weights)
-        times = []
-        with without_subnormals():
-            for step in range(train.scene_steps, train.scene_steps + 3):
-                clock = Stopwatch(torch.device(device))
-                imitation.loss(draw(step), step)[0].backward()
-                times.append(clock.stop())
-        return train.steps * min(times[1:])
-
-    return Plan("target", folder, f"{folder}: {plan}", work, check, train.steps, seconds)
+def origin_of(init: Path | None) -> dict[str, str]:
+    return {"init": read_target(init).sha256} if init else {}
 
 
 def refuse_contradictions(settings: TrainTargetSettings) -> None:

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor, nn
 from transformers import DynamicCache, LlamaConfig, LlamaForCausalLM
 
-from kerv_cli.base.paths import artifact
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.targets import TargetPart
 from kerv_cli.targets.checkpoint import TargetDescription, load_state, save_module, target_fields
@@ -88,17 +87,17 @@ class OwnLlama(nn.Module):
         return self.model.lm_head(hidden)[..., -self.actions.tokens :].flip(-1)
 
 
-def write(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
+def write(settings: BuildTargetSettings, folder: Path) -> dict[str, Any]:
     if settings.checkpoint:
         model = LlamaForCausalLM.from_pretrained(settings.checkpoint)
     else:
         torch.manual_seed(0)
         model = LlamaForCausalLM(LlamaConfig(**TINY, initializer_range=0.5))
-    policy, folder = OwnLlama(model, SPEC.actions), artifact(settings.results, "target", settings.name)
+    policy = OwnLlama(model, SPEC.actions)
     own = {"chunk": policy.chunk, "llama": json.loads(model.config.to_json_string())}
     fields = target_fields("own_llama", own, SPEC.name, policy.actions, SPEC.observation)
     save_module(folder, "target", policy, fields)
-    return folder, {"parameters": model.num_parameters()}
+    return {"parameters": model.num_parameters()}
 
 
 @TargetPart("own_llama", importer=write)

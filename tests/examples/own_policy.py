@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from kerv_cli.base.paths import artifact
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.targets import TargetPart
 from kerv_cli.targets.checkpoint import TargetDescription, load_state, save_module, target_fields
@@ -77,12 +76,12 @@ class OwnPolicy(nn.Module):
         return hidden @ self.rows.T
 
 
-def write(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
+def write(settings: BuildTargetSettings, folder: Path) -> dict[str, Any]:
     """`kerv build target target=own`: here random weights; yours are those in `settings.checkpoint`."""
-    folder, policy = artifact(settings.results, "target", settings.name), OwnPolicy()
+    policy = OwnPolicy()
     fields = target_fields("own", {"chunk": policy.chunk}, SPEC.name, policy.actions, SPEC.observation)
     save_module(folder, "target", policy, fields)
-    return folder, {"action tokens": policy.actions.tokens}
+    return {"action tokens": policy.actions.tokens}
 
 
 @TargetPart("own", importer=write)

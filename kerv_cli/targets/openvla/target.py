@@ -23,7 +23,6 @@ from torch import Tensor
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import write_json
 from kerv_cli.base.manifests import read
-from kerv_cli.base.paths import artifact
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.engine.draft import upload
 from kerv_cli.engine.protocol import Seen
@@ -148,11 +147,8 @@ def check_weights(folder: Path, description: TargetDescription) -> None:
 NO_STATE = ObservationSpace(proprioception=(), state=0, places=(), centre=(0.0, 0.0, 0.0))
 
 
-def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, Any]]:
-    """Make a target from an OpenVLA checkpoint, after checking all its weights.
-
-    Return its folder, and numbers to print by name.
-    """
+def import_checkpoint(settings: BuildTargetSettings, folder: Path) -> dict[str, Any]:
+    """Check all weights of an OpenVLA checkpoint, and write `target.json`. Return numbers to print, by name."""
     if not settings.checkpoint:
         raise UsageError("checkpoint=DIR: name the folder of a Hugging Face OpenVLA checkpoint")
     source = Path(settings.checkpoint).expanduser().resolve()
@@ -179,8 +175,7 @@ def import_checkpoint(settings: BuildTargetSettings) -> tuple[Path, dict[str, An
         cameras=[spec.camera_name(settings.camera) if spec else settings.camera or "primary"],
         provenance=provenance_of("kerv build target", settings, settings.runtime.device, **figures),
     )
-    folder = artifact(settings.results, "target", settings.name)
     described = {"format": FORMAT, "kind": "target", "sha256": digest_of(hashes, chosen), **fields}
     write_json(folder / "target.json", described)
     sizes = {"prompt tokens": shape.patches + len(prompt), "action tokens": actions.tokens, "DoFs": actions.dofs}
-    return folder, {"parameters": parameters, **sizes}
+    return {"parameters": parameters, **sizes}
