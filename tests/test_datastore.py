@@ -334,8 +334,8 @@ def test_only_a_datastore_is_ever_replaced(copy):
     shutil.rmtree(other)
     other.mkdir()
     (other / "thesis.tex").write_text("years of work")
-    with pytest.raises(UsageError):
-        build(asked(copy, named="other"))
+    with pytest.raises(UsageError, match="is there already"):
+        build(asked(copy, named="other", replace=False))
     with pytest.raises(UsageError):
         build(asked(copy, named=str(copy / "artifacts/target/nano-state")))
 
@@ -378,7 +378,9 @@ def test_a_rebuild_replaces_the_whole_datastore_and_is_the_same(copy):
 
 def test_a_plan_counts_what_would_be_stored(results):
     words = ("policy.target=nano-state", "demos=few", "task=reach,drawer-close", f"results={results}")
-    assert "6 demonstrations of 2 tasks, 52 control steps" in told("build", "datastore", *words, "--plan")
+    assert "6 demonstrations of 2 tasks, 52 control steps" in told(
+        "build", "datastore", *words, "replace=true", "--plan"
+    )
 
 
 def leaves(tree: TokenTree) -> list[tuple[int, ...]]:
