@@ -19,7 +19,7 @@ import sqlalchemy as sa
 from command import refusal, told
 from conftest import served
 from starlette.testclient import TestClient
-from studies_synthetic import episode, swept, threshold_study, unhurried
+from studies_synthetic import episode, planned, swept, threshold_study, unhurried
 
 from kerv_cli.base.errors import KervError
 from kerv_cli.board import app, runs
@@ -28,6 +28,7 @@ from kerv_cli.episodes.rows import episode_row, seconds_blob
 from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, SETTINGS, WANTED, now, opened
 from kerv_cli.lab.runs import Run
 from kerv_cli.lab.store import Study
+from kerv_cli.lab.study import save
 
 HERE = "http://127.0.0.1"
 TASKS = ["drawer-open-v3", "reach-v3"]
@@ -184,7 +185,7 @@ def test_pages_are_quick_with_ten_thousand_episodes_and_two_hundred_runs(tmp_pat
     rows = [episode_row(episode(study.settings[3], "reach-v3", seed)) for seed in range(20)]
     values = {"started": now(), "block": "b", "decode_seconds": seconds_blob([0.01] * 20)}
     store = replace(study, database=opened(tmp_path))
-    store.save()
+    save(planned(store.database, study))
     with Run(store.database, "sweep", "large", ["sweep"]):
         pass
     names = ("work", "task", "seed")

@@ -94,7 +94,7 @@ def test_tasks_with_different_horizons_need_one(monkeypatch, tmp_path):
     monkeypatch.setattr(packages, "check_packages", lambda: None)
     monkeypatch.setattr(spec_module, "version", lambda name: "1")
     words = ["policy=expert", "episodes=1", f"results={tmp_path}"]
-    assert "have 220 or 300 control steps: type world.horizon=N" in refusal(
+    assert "have 220 or 300 control steps: type world.horizon=300" in refusal(
         "rollout", "task=[bowl-on-stove,turn-on-stove]", *words, code=2
     )
     for command in ("rollout", "demos"):

@@ -158,8 +158,8 @@ class EnvironmentSpec:
         found = sorted({self.task(name).horizon or self.horizon for name in tasks}) or [self.horizon]
         if not horizon and len(found) > 1:
             raise UsageError(
-                f"episodes of these tasks have {' or '.join(map(str, found))} control steps: type world.horizon=N, or "
-                "run them one after the other, -m task=A,B"
+                f"episodes of these tasks have {' or '.join(map(str, found))} control steps: type "
+                f"world.horizon={found[-1]}, or one command for each number"
             )
         return horizon or found[0]
 
