@@ -103,4 +103,4 @@ def test_it_is_trained_from_the_command_line_and_drafts_in_every_place(results):
             decoder.observe(np.zeros(4), np.zeros(3))
         record, truth = (one.decode(Observation(state[:4], state, "reach the goal")) for one in (drafting, plain))
         assert record.tokens == truth.tokens
-        assert {"follow", "merged"} & {r.proposer for r in record.rounds}
+        assert any("follow" in r.proposer.split("+") for r in record.rounds)
