@@ -54,11 +54,6 @@ class Workers(ProcessPoolExecutor):
     def __init__(self, count: int) -> None:
         super().__init__(count, multiprocessing.get_context("spawn"), begin_worker, (os.getpid(),))
 
-    @property
-    def is_broken(self) -> bool:
-        """Whether a process has died. The pool then takes no more work."""
-        return bool(self._broken)
-
     def kill(self) -> None:
         """End all processes at once, whatever they are doing, and drop all waiting work."""
         processes = list((self._processes or {}).values())

@@ -67,12 +67,6 @@ class Stopwatch:
         return event
 
 
-def _event() -> torch.cuda.Event:
-    event = torch.cuda.Event(enable_timing=True)
-    event.record()
-    return event
-
-
 @dataclass(frozen=True)
 class Parts:
     """The parts of a decoding method (docs/methods.md §2). With the defaults, the target decodes autoregressively."""

@@ -389,10 +389,6 @@ def split_values(texts: Iterable[object]) -> set[str]:
     return set(";".join(map(str, texts)).split(";"))
 
 
-def is_stressed(results: Iterable[Result]) -> bool:
-    return len(set(map(attrgetter("stress", "stress_level"), results))) > 1
-
-
 _LATENCY_COLUMNS = (
     "study", "label", "method", "ar", "rollout.clock", "rollout.latency", "rollout.latency_ms", "rollout.profile",
     "rollout.ar_ms", "rollout.delay_compensation", "rollout.batch", "ar_latency_ms", "episodes", "felt_latency_ms",
