@@ -222,13 +222,15 @@ def close_servers() -> None:
 
 
 def metadata_of(url: str) -> Message:
-    """Return what a server says about its policy."""
-    _servers.pop(url, Server(url)).close()
+    """Return what a server says about its policy now. Decoders of the same policy connect again when they ask."""
     server = server_at(url)
     try:
-        return server.connect()
+        metadata = server.connect()
     finally:
         server.close()
+    if metadata != server.metadata:
+        _servers.pop(url)
+    return metadata
 
 
 class RemoteDecoder(Follower):
