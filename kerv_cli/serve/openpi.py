@@ -34,7 +34,6 @@ def metadata(policy: Policy) -> dict[str, object]:
 
 
 def observation_of(interface: Interface, message: Message) -> Observation:
-    prompt = text_of(message.get(PROMPT), PROMPT)
     images = {}
     for camera in interface.cameras:
         keys = [f"observation/{camera}", *([IMAGE] if len(interface.cameras) == 1 else [])]
@@ -42,7 +41,8 @@ def observation_of(interface: Interface, message: Message) -> Observation:
         if key is None:
             raise UsageError(f"no image: {' or '.join(keys)} is wanted, the message has {keys_of(message)}")
         images[camera] = interface.image(message[key], camera, key)
-    return Observation(*interface.numbers(message.get(STATE), STATE, message), prompt, images)
+    numbers = interface.numbers(message.get(STATE), STATE, message)
+    return Observation(*numbers, text_of(message.get(PROMPT), PROMPT), images)
 
 
 class OpenPi(Conversation):

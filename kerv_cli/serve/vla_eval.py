@@ -149,13 +149,12 @@ class VlaEval(Conversation):
     def _observation(self, payload: Message, numbers: tuple[np.ndarray, np.ndarray]) -> Observation:
         images = payload.get("images")
         images = images if isinstance(images, dict) else {}
-        instruction = text_of(payload.get("task_description"), "task_description")
         frames = {}
         for camera in self.interface.cameras:
             if camera not in images:
                 raise UsageError(f"no image of camera {camera}: the message has images of {keys_of(images)}")
             frames[camera] = self.interface.image(images[camera], camera, f"images.{camera}")
-        return Observation(*numbers, instruction, frames)
+        return Observation(*numbers, text_of(payload.get("task_description"), "task_description"), frames)
 
     def _end(self, payload: Message) -> None:
         episode, self.episode = self.episode, None
