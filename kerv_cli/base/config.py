@@ -284,10 +284,9 @@ def _composed(choices: tuple[tuple[str, str], ...], schema: type, conf: Path, ar
     _open_mappings(nodes)
     for group, name in choices:
         if name not in known[group]:
-            error = UnknownName(group, name, known[group])
-            if group in SETTINGS_GROUPS and not os.environ.get(PLUGINS):
-                raise UsageError(f"{error} (a plugin's name needs {PLUGINS}=MODULE)", group)
-            raise error
+            may_be_plugin = group in SETTINGS_GROUPS and not os.environ.get(PLUGINS)
+            remedy = f" (a plugin's name needs {PLUGINS}=MODULE)" if may_be_plugin else ""
+            raise UnknownName(group, name, known[group], remedy)
         part, values = _choice(group, name)
         if part is not None:
             nodes[group] = OmegaConf.structured(part.default)

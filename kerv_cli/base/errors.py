@@ -55,13 +55,14 @@ class UnknownName(UsageError):
         kind: Kind of thing that is named, such as `task`, for the message.
         name: The unknown name.
         names: The known names.
+        remedy: Further text at the end of the message.
     """
 
-    def __init__(self, kind: str, name: str, names: Iterable[str]) -> None:
+    def __init__(self, kind: str, name: str, names: Iterable[str], remedy: str = "") -> None:
         names = list(names)
         more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
         hint = did_you_mean(name, names) or (f"known: {', '.join(names[:_LISTED])}{more}" if names else "there is none")
-        super().__init__(f"unknown {kind} '{name}': {hint}", kind)
+        super().__init__(f"unknown {kind} '{name}': {hint}{remedy}", kind)
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
