@@ -69,7 +69,8 @@ def slurm():
         text = CONFIGURATION.format(host=host, ports=ports, user=user, folder=folder)
         (folder / "slurm.conf").write_text(text)
         patch.setenv("SLURM_CONF", str(folder / "slurm.conf"))
-        patch.setenv("PATH", "/usr/sbin", prepend=os.pathsep)
+        # without the folder of `kerv`: whoever types .venv/bin/kerv may not have it either
+        patch.setenv("PATH", "/usr/sbin:/usr/local/bin:/usr/bin:/bin")
         files = {"key-file": "key", "socket": "socket", "pid-file": "pid", "log-file": "log", "seed-file": "seed"}
         run("munged", "--force", *(f"--{option}={folder}/munge/{file}" for option, file in files.items()))
         try:

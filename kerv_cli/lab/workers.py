@@ -14,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import IO, Any
 
 import sqlalchemy as sa
@@ -95,7 +96,9 @@ def workers(plan: Plan, run: str, say: Callable[[str], object] = lambda line: No
         KervError: The command of `runtime.launch` fails.
     """
     runtime, study = plan.runtime, plan.study
-    environment = os.environ | {STORE: study.database.store}
+    # a cluster's jobs find `kerv` where this process runs, also when its folder is not on the user's PATH
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
+    environment = os.environ | {STORE: study.database.store, "PATH": path}
     if plan.blocks and plan.is_elsewhere:
         line = work_command(study.database, study.name)
         if runtime.launch:
