@@ -368,7 +368,6 @@ ANSWERS = [
     ("report on=h100", "on=h100: name the study with study=NAME"),
     ("runs compare a", "name two runs, ID or ID:SETTING: 'kerv runs list' shows them"),
     ("runs rm", "name a run: 'kerv runs list' shows them"),
-    ("build drafter", "checkpoint=DIR: name the folder of a drafter"),
     # studies
     ("sweep study=typo.yaml", "typo.yaml:1: unknown key 'study.setings': did you mean study.settings"),
     ("sweep study=no_baseline.yaml", "study 'no_baseline' has no setting 'ar', the baseline that its others are"),
@@ -386,10 +385,6 @@ ANSWERS = [
     ("sweep study=demo method=ar", "study 'demo' sets method itself: leave it out"),
     ("sweep threshold.r=1,2,3", "of which study? name one, study=NAME: 'kerv sweep' lists them; 'kerv rollout -m'"),
     # artifacts and policies
-    (
-        "build drafter checkpoint=published",
-        "is there, as a part of a shipped policy: policy.artifacts.drafter=NAME makes one of yours",
-    ),
     ("serve method=heisd", "its calibration or drafts differ between tasks: name one with task=NAME"),
     ("serve method=spec_vla proposer=retrieval task=rech", "unknown task 'rech': did you mean reach-v3?"),
     ("serve policy=expert", "policy=expert: it needs the simulator and cannot be served"),

@@ -1,4 +1,4 @@
-"""The OpenVLA target and public drafters on tiny random checkpoints: equal to transformers' own models, lossless."""
+"""The OpenVLA target on tiny random checkpoints: equal to transformers' own models, lossless."""
 
 import io
 import itertools
@@ -7,7 +7,6 @@ import math
 import re
 import shutil
 from collections.abc import Callable
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,21 +17,18 @@ from command import kerv, refusal
 from examples.tiny_openvla import ROBOT, TINY, write_checkpoint
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from loaded import of_target
 from openvla_reference import Reference
 from PIL import Image
 from safetensors.torch import load_file, save_file
 from scipy.ndimage import map_coordinates
-from test_decoding_lossless import RandomTrees, assert_adds_up, decode, plain_greedy
+from test_decoding_lossless import RandomTrees, assert_adds_up, plain_greedy
 from torch import Tensor
 
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.paths import artifact
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
-from kerv_cli.methods.eagle.public import Convention, PublicDrafter, PublicShape
-from kerv_cli.targets.checkpoint import load_target, read_target
+from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.openvla.config import TOWERS, Bounds, Language, Shape, action_space, read_shape
 from kerv_cli.targets.openvla.inputs import as_in_libero, cropped, pixels_of
 from kerv_cli.targets.openvla.loading import is_unread, layout
@@ -357,122 +353,3 @@ def test_weights_stay_in_the_files_memory_map(checkpoint, target):
     mapped = [line.split() for line in Path("/proc/self/maps").read_text().splitlines() if str(checkpoint) in line]
     spans = [tuple(int(x, 16) for x in line[0].split("-")) for line in mapped]
     assert any(low <= address < high for low, high in spans)
-
-
-# --- public drafter
-
-LANGUAGE = Language(704, 64, 96, 1, 4)
-KERV, TEXT, PROMPT = Convention(), Convention("text"), Convention(mask="prompt")
-PATCHES = 16
-
-
-@pytest.fixture(scope="module")
-def drafter():
-    """Untrained: what is drafted does not matter to what these tests say."""
-    torch.manual_seed(1)
-    return PublicDrafter(PublicShape(LANGUAGE, True, KERV, PATCHES)).eval().requires_grad_(False)
-
-
-def with_convention(drafter: PublicDrafter, convention: Convention) -> PublicDrafter:
-    other = PublicDrafter(replace(drafter.shape, convention=convention))
-    other.load_state_dict(drafter.state_dict())
-    return other.eval().requires_grad_(False)
-
-
-def written(folder: Path, drafter: PublicDrafter, embedding: Tensor) -> Path:
-    """As the public codes save it, with a copy of the embeddings."""
-    folder.mkdir(parents=True)
-    (folder / "config.json").write_text(json.dumps({**asdict(LANGUAGE), "model_type": "llama", "pad_token_id": 0}))
-    save_file({**drafter.state_dict(), "embed_tokens.weight": embedding.clone()}, folder / "model.safetensors")
-    return folder
-
-
-@pytest.mark.bits
-def test_it_computes_what_the_public_layer_does():
-    """EAGLE's forward, spelt out with transformers' layer: fc over (embedding, state), no norm in front or behind."""
-    from transformers import LlamaConfig
-    from transformers.models.llama.modeling_llama import LlamaDecoderLayer, LlamaRotaryEmbedding
-
-    torch.manual_seed(3)
-    drafter = PublicDrafter(PublicShape(LANGUAGE, True, KERV, PATCHES)).eval().requires_grad_(False)
-    numbers = {k: v for k, v in asdict(LANGUAGE).items() if k != "rope_theta"}
-    config = LlamaConfig(**numbers, attn_implementation="eager")
-    layer = LlamaDecoderLayer(config, 0).eval()
-    own = {k.removeprefix("layers.0."): v for k, v in drafter.state_dict().items() if k.startswith("layers.0.")}
-    layer.load_state_dict(own, strict=False)
-    layer.input_layernorm = torch.nn.Identity()
-    following, hidden = torch.randn(2, 1, 9, 64)
-    positions = torch.arange(9)
-    x = drafter.fc(torch.cat([following, hidden], -1))
-    mask = torch.full((9, 9), -torch.inf).triu(1)[None, None]
-    turned = LlamaRotaryEmbedding(config)(x, positions[None])
-    out = layer(x, attention_mask=mask, position_ids=positions[None], position_embeddings=turned)
-    reference = out[0] if isinstance(out, tuple) else out
-    torch.testing.assert_close(drafter(following, hidden, positions), reference.view(1, 9, 64), atol=1e-5, rtol=1e-5)
-
-
-@pytest.mark.bits
-@pytest.mark.parametrize("convention", [KERV, TEXT, PROMPT, Convention("text", "prompt")])
-@pytest.mark.parametrize("top_k", [1, 3])
-def test_decoding_with_it_is_lossless_under_every_convention(target, drafter, convention, top_k):
-    own = with_convention(drafter, convention)
-    for seed in (100, 101):
-        with torch.inference_mode():
-            prompt = target.encode(shown(seed))
-            truth = plain_greedy(target, prompt)
-        assert decode(target, DrafterProposer(own, target, 5, top_k, 16), prompt).tokens == truth
-
-
-def test_the_prompt_mask_hides_every_key_behind_the_prompt(drafter):
-    own = with_convention(drafter, PROMPT)
-    following, hidden = torch.randn(2, 1, 12, 64)
-    outputs = []
-    for _ in range(2):
-        cache = own.new_cache(1, 20)
-        own(following[:, :10], hidden[:, :10], torch.arange(10), cache)
-        outputs.append(own(following[:, 11:], hidden[:, 11:], torch.tensor([11]), cache))
-        hidden[:, 9] += 1  # the last prompt position: its key is the first that is hidden
-    torch.testing.assert_close(outputs[0], outputs[1])
-
-
-def test_it_is_imported_beside_its_target(results, target, drafter, tmp_path):
-    folder = written(tmp_path / "eagle", drafter, target.model.language_model.model.embed_tokens.weight)
-    words = [f"checkpoint={folder}", "policy.target=openvla", f"results={results}"]
-    kerv("build", "drafter", *words, "positions=text")
-    description = json.loads((results / "artifacts/drafter/openvla/drafter.json").read_text())
-    assert description["public"]["convention"] == {"positions": "text", "mask": "causal"}
-    described = read_target(results / "artifacts/target/openvla")
-    described_target = of_target(described, target)
-    own: Any = EagleDrafter().load(results / "artifacts/drafter/openvla", described_target)
-    assert (own.skipped, drafter.skipped) == (16, 0)
-    for name, tensor in own.state_dict().items():
-        torch.testing.assert_close(tensor, drafter.state_dict()[name])
-
-
-def renamed(folder: Path) -> None:
-    path = folder / "model.safetensors"
-    tensors = {name: tensor.clone() for name, tensor in load_file(path).items()}
-    save_file({name.replace("fc.weight", "fx.weight"): tensor for name, tensor in tensors.items()}, path)
-
-
-def widened(folder: Path) -> None:
-    (folder / "config.json").write_text(json.dumps({**asdict(LANGUAGE), "hidden_size": 128}))
-
-
-@pytest.mark.parametrize(
-    ("harm", "words", "said"),
-    [
-        (renamed, [], "1 missing: fc.weight; 1 unknown: fx.weight"),
-        (widened, [], "the drafter in"),
-        (pickled, [], "is pickled and can run code when it is opened: convert it"),
-        (None, ["positions=whole"], "unknown positions 'whole': known: sequence, text"),
-        (None, ["checkpoint="], "checkpoint=DIR"),
-    ],
-)
-def test_a_drafter_that_does_not_fit_is_refused_in_one_line(results, drafter, tmp_path, harm, words, said):
-    folder = written(tmp_path / "eagle", drafter, torch.zeros(704, 64))
-    if harm:
-        harm(folder)
-    words = words if "checkpoint=" in words else [f"checkpoint={folder}", *words]
-    named = ["policy.target=openvla", "policy.artifacts.drafter=other", f"results={results}"]
-    assert said in refusal("build", "drafter", *words, *named)

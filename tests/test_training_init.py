@@ -270,7 +270,6 @@ OUTSIDE = "../../../outside"
         f"train drafter policy.artifacts.drafter={OUTSIDE} demos=few train.steps=1",
         f"train drafter drafter=early policy.artifacts.early={OUTSIDE} demos=few train.steps=1",
         f"build target grow=60m name={OUTSIDE}",
-        f"build drafter checkpoint=public policy.artifacts.drafter={OUTSIDE}",
         f"build datastore policy.artifacts.datastore={OUTSIDE} demos=few",
         f"calibrate policy.artifacts.calibration={OUTSIDE} demos=few",
     ],

@@ -12,7 +12,7 @@ from kerv_cli.cli.command import command
 from kerv_cli.cli.common import AsJson, ShowPlan, database_of, made, print_figures
 from kerv_cli.targets import TargetPart
 from kerv_cli.targets.settings import BuildTargetSettings
-from kerv_cli.training.settings import BuildDatastoreSettings, BuildDrafterSettings
+from kerv_cli.training.settings import BuildDatastoreSettings
 
 
 @command(
@@ -45,27 +45,6 @@ def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
     with making(database_of(settings), "target", folder), owned(folder, check):
         write_folder(folder, lambda new: figures.update(importer(settings, new)))
     print_figures("target", figures, folder, as_json)
-
-
-@command(
-    "build drafter",
-    BuildDrafterSettings,
-    keys="checkpoint policy.target policy.artifacts positions mask replace results",
-)
-def drafter(settings: BuildDrafterSettings, as_json: AsJson = False) -> None:
-    """Import a drafter in the public EAGLE or Spec-VLA layout for a target.
-
-    Examples:
-        kerv build drafter checkpoint=models/eagle policy.target=openvla
-        kerv build drafter checkpoint=models/eagle policy.target=openvla policy.artifacts.drafter=public mask=prompt
-    """
-    if not settings.checkpoint:
-        raise UsageError("checkpoint=DIR: name the folder of a drafter (config.json, model.safetensors)")
-    from kerv_cli.training.drafter import plan_import
-
-    with made(plan_import(settings), database_of(settings)) as (folder, figures):
-        pass
-    print_figures("drafter", figures, folder, as_json)
 
 
 @command(

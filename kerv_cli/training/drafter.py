@@ -1,16 +1,13 @@
-"""`kerv train drafter`: train a drafter to imitate the target. `kerv build drafter`: import a published drafter."""
+"""`kerv train drafter`: train a drafter to imitate the target."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from kerv_cli.base.files import write_folder
-from kerv_cli.base.paths import check_free
 from kerv_cli.base.registry import ProposerPart, find
 from kerv_cli.base.runtime import set_up
 from kerv_cli.engine.decoder import Stopwatch
@@ -18,9 +15,6 @@ from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import command_to_go_on
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.drafters import TrainableDrafter
-from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.drafter import EagleDrafter
-from kerv_cli.methods.eagle.public import Convention, read_public
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_tasks, demos_for
@@ -35,7 +29,7 @@ from kerv_cli.training.fit import (
     seconds_of,
     without_subnormals,
 )
-from kerv_cli.training.settings import BuildDrafterSettings, Plan, Stage, TrainDrafterSettings
+from kerv_cli.training.settings import Plan, Stage, TrainDrafterSettings
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
@@ -135,27 +129,3 @@ def plan_drafter(settings: TrainDrafterSettings, database: Database) -> Plan[tup
     text = f"{folder}: {layers}{drafter.noun} of {artifacts.folder}{samples}, {train.steps} steps of {train.batch}"
     training = DrafterTraining(settings, drafter, artifacts, dataset, place)
     return Plan(drafter.kind, folder, text, training.work, place.check, train.steps, training.seconds)
-
-
-def plan_import(settings: BuildDrafterSettings) -> Plan[tuple[Path, dict[str, Any]]]:
-    """Check that a published drafter fits a target. The work copies it, and returns its folder and facts to print."""
-    convention = Convention(settings.positions, settings.mask)
-    device, _ = set_up(settings.runtime)
-    artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
-    folder = artifacts.new(EagleDrafter.kind)
-
-    check = partial(check_free, folder, "policy.artifacts.drafter", settings.replace)
-    check()
-    network = read_public(Path(settings.checkpoint).expanduser(), artifacts.target, convention)
-    layers = network.shape.language.num_hidden_layers
-    figures = {"parameters": sum(tensor.numel() for tensor in network.parameters())}
-    provenance = provenance_of("kerv build drafter", settings, device, **figures)
-    shapes = asdict(DrafterSettings(kind="public", layers=layers))
-    made_for = MadeFor.of(artifacts.description)
-
-    def work(stage: Stage) -> tuple[Path, dict[str, Any]]:
-        more: dict[str, Any] = {"settings": shapes, "public": asdict(network.shape)}
-        write_folder(folder, lambda new: EagleDrafter().save(new, network, made_for, provenance, **more))
-        return folder, {**figures, "layers": layers, **asdict(convention)}
-
-    return Plan(EagleDrafter.kind, folder, str(folder), work, check)

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import owned
 from kerv_cli.base.limits import choice, limits, number, setting
-from kerv_cli.base.settings import REPLACE, RunSettings, TaskSettings, chosen
+from kerv_cli.base.settings import REPLACE, TaskSettings, chosen
 from kerv_cli.episodes.settings import DEFAULT_TASKS
 from kerv_cli.methods.settings import POLICY, MethodSettings, PolicySettings
 from kerv_cli.targets.settings import TargetSettings
@@ -169,26 +169,6 @@ class PrepareSettings(DemonstrationSettings):
     quick: bool = setting(False, QUICK)
     methods: list[str] = setting([], "names of the methods; empty: all")
     steps: int = number(0, 0, 10**9, help="optimisation steps of each drafter; 0: as kerv train drafter")
-
-
-@dataclass
-class BuildDrafterSettings(RunSettings):
-    """Settings of `kerv build drafter`, which imports a published EAGLE or Spec-VLA drafter.
-
-    The setting `policy.artifacts.drafter` gives the name under which the imported drafter is stored.
-    """
-
-    groups: ClassVar = {"policy": "vision", "runtime": "cpu"}
-
-    policy: PolicySettings = setting(PolicySettings, POLICY)
-    checkpoint: str = setting("", "folder of the published drafter, with config.json and model.safetensors")
-    replace: bool = setting(False, REPLACE)
-    positions: str = choice(
-        "sequence", "sequence", "text", help="text: vision tokens get no position number (docs/methods.md §2.2)"
-    )
-    mask: str = choice(
-        "causal", "causal", "prompt", help="prompt: tokens see only the prompt without its last token (§2.2)"
-    )
 
 
 @dataclass

@@ -28,14 +28,14 @@ from kerv_cli.engine.decoder import Decoder, Parts, greedy
 from kerv_cli.engine.draft import HOST, Draft, upload
 from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.proposer import Proposer
-from kerv_cli.engine.protocol import JoinsDrafters, ReadableTarget, Target
+from kerv_cli.engine.protocol import JoinsDrafters, ReadableTarget, Seen, Target
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.context import Context
-from kerv_cli.methods.drafters import Decodes, DrafterDescription, Metrics, TrainableDrafter
+from kerv_cli.methods.drafters import Decodes, Metrics, TrainableDrafter
 from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.public import DraftNetwork, PublicDrafter, PublicShape
 from kerv_cli.methods.spec_vla import RelaxedRule
-from kerv_cli.targets.compact.program import Program, load_compiled
+from kerv_cli.targets.attention import Cache
+from kerv_cli.targets.compact.program import Program
 from kerv_cli.targets.compact.trunk import LayerStack
 from kerv_cli.targets.observations import observations_of, prompts_of
 from kerv_cli.worlds.demos.files import DemoEpisode
@@ -43,7 +43,7 @@ from kerv_cli.worlds.demos.files import DemoEpisode
 VALIDATED = 60  # maximum number of held-out observations that a validation decodes
 
 
-class EagleNetwork(DraftNetwork, LayerStack):
+class EagleNetwork(LayerStack):
     """The drafter's network: decoder layers of the target's shape. It uses the target's embeddings and head."""
 
     inputs = 2
@@ -55,6 +55,19 @@ class EagleNetwork(DraftNetwork, LayerStack):
 
     def enter(self, *inputs: Tensor) -> Tensor:
         return self.fuse(torch.cat(inputs, -1))
+
+    def forward(
+        self, following: Tensor, hidden: Tensor, positions: Tensor, cache: Cache | None = None, seen: Seen = None
+    ) -> Tensor:
+        """Return the predicted hidden states (B, T, E) at the next positions.
+
+        Args:
+            following: (B, T, E) embedding of the token after each position.
+            hidden: (B, T, E) hidden states at the positions.
+            positions: (T,) rotary positions.
+            seen: Attention mask (T, M) bool over the last M tokens. If None, attention is causal.
+        """
+        return self.run((following, hidden), positions, cache, seen)
 
     def joined(self, target: Any, tree: bool) -> Any:
         """Return a compiled program that drafts level after level. None if drafter or target is not compiled."""
@@ -79,14 +92,12 @@ class DrafterProposer(Proposer):
 
     name = "drafter"
 
-    def __init__(
-        self, drafter: EagleNetwork | PublicDrafter, target: Target, depth: int, top_k: int, nodes: int
-    ) -> None:
+    def __init__(self, drafter: EagleNetwork, target: Target, depth: int, top_k: int, nodes: int) -> None:
         self.drafter, self.target = drafter, target
         self.depth, self.top_k, self.nodes = depth, min(top_k, target.actions.tokens), nodes
         capacity = target.max_prompt + target.actions.longest(target.chunk) + top_k * depth
         self.cache, self.hidden = drafter.new_cache(1, capacity), torch.empty(0)
-        self.compiled = drafter.joined(target, top_k > 1) if isinstance(drafter, EagleNetwork) else None
+        self.compiled = drafter.joined(target, top_k > 1)
 
     def begin(self, chunk: Chunk) -> None:
         hidden = chunk.target.hidden
@@ -113,8 +124,7 @@ class DrafterProposer(Proposer):
         base = self.cache.length
         if self.compiled is not None:
             return torch.from_numpy(self.compiled.repeat(depth, self.hidden, cache=self.cache)[:, 0]).long()
-        first = base - self.drafter.skipped
-        positions = torch.arange(first, first + depth, device=self.hidden.device).split(1)
+        positions = torch.arange(base, base + depth, device=self.hidden.device).split(1)
         hidden = self.hidden[None, None]
         drafted = [self.target.head(hidden[0]).argmax(-1)]
         for reached in range(depth - 1):
@@ -132,10 +142,9 @@ class DrafterProposer(Proposer):
         parent.
         """
         target, top_k, device, base = self.target, self.top_k, self.hidden.device, self.cache.length
-        first = base - self.drafter.skipped
         if self.compiled is not None:
             root = self.hidden[None, None]
-            grown = self.compiled.grow(depth, top_k, self.nodes, root, position=first, cache=self.cache)
+            grown = self.compiled.grow(depth, top_k, self.nodes, root, position=base, cache=self.cache)
             return Draft(torch.from_numpy(grown[0]), torch.from_numpy(grown[1]), depth, grown[2])
         values, tokens = _most(torch.log_softmax(target.head(self.hidden).float(), -1), top_k)
         every, parents, cumulative = [tokens], [torch.full_like(tokens, ROOT)], [values]
@@ -144,7 +153,7 @@ class DrafterProposer(Proposer):
         seen = itself = torch.eye(top_k, dtype=torch.bool, device=device)  # draft nodes that each node of a level sees
         for reached in range(1, depth):
             following = target.embed(tokens[None])
-            position = torch.full((top_k,), first + reached - 1, device=device)
+            position = torch.full((top_k,), base + reached - 1, device=device)
             hidden = self.drafter(following, hidden, position, self.cache, seen.numpy() if device == HOST else seen)
             logp = torch.log_softmax(target.head(hidden[0]).float(), -1) + values[:, None]
             child_values, child_tokens = (best.flatten() for best in _most(logp, top_k))
@@ -185,33 +194,21 @@ class EagleExamples(Decodes):
     hidden: Tensor
 
 
-@dataclass(frozen=True, kw_only=True)
-class EagleDescription(DrafterDescription):
-    """Contents of the JSON file beside the weights. `public` is None for a drafter in our own layout."""
-
-    public: PublicShape | None = None
-
-
 class EagleDrafter(TrainableDrafter):
     """EAGLE-style drafters, which are artifacts of the kind `drafter`. They work for chunks of any length."""
 
     kind = noun = "drafter"
     command = ("train", "drafter")
-    schema = EagleDescription
     settings = DrafterSettings
     any_chunk = True
 
     def network(self, settings: DrafterSettings, target: ReadableTarget) -> EagleNetwork:
         return EagleNetwork(settings, target.width, target.heads, target.feed_forward)
 
-    def load(self, path: Path, artifacts: Artifacts) -> EagleNetwork | PublicDrafter:
-        description: Any = self.checked(path, artifacts.description)
-        target = artifacts.target
-        if description.public is not None:
-            return load_compiled(PublicDrafter(description.public), path, self.kind, target.device, target.dtype)
+    def load(self, path: Path, artifacts: Artifacts) -> EagleNetwork:
         network: EagleNetwork = super().load(path, artifacts)
-        if isinstance(target, JoinsDrafters):
-            target.enlarge(network)
+        if isinstance(artifacts.target, JoinsDrafters):
+            artifacts.target.enlarge(network)
         return network
 
     @classmethod

@@ -71,15 +71,12 @@ class LlamaPerceptron(nn.Module):
 
 
 class LlamaLayer(nn.Module):
-    """One pre-norm decoder layer.
+    """One pre-norm decoder layer."""
 
-    `normed=False` leaves out the norm before the attention, as public EAGLE drafters do.
-    """
-
-    def __init__(self, language: Language, normed: bool = True) -> None:
+    def __init__(self, language: Language) -> None:
         super().__init__()
         width, epsilon = language.hidden_size, language.rms_norm_eps
-        self.input_layernorm = nn.RMSNorm(width, eps=epsilon) if normed else nn.Identity()
+        self.input_layernorm = nn.RMSNorm(width, eps=epsilon)
         self.self_attn = LlamaAttention(language)
         self.post_attention_layernorm = nn.RMSNorm(width, eps=epsilon)
         self.mlp = LlamaPerceptron(language)
@@ -90,19 +87,6 @@ class LlamaLayer(nn.Module):
         """Return the layer's output (B, T, E) for x (B, T, E). `cache` (2, B, K, capacity, C) is this layer's."""
         x = x + self.self_attn(self.input_layernorm(x), rotary, mask, cache, slots)
         return x + self.mlp(self.post_attention_layernorm(x))
-
-
-def run_layers(
-    layers: nn.ModuleList, language: Language, x: Tensor, positions: Tensor, cache: Cache | None, mask: Tensor | None
-) -> Tensor:
-    """Run the layers over T new tokens x (B, T, E) at positions (T,), and append their keys and values to the cache."""
-    rotary = rotation(positions, language.channels, language.rope_theta, x.dtype)
-    slots = cache.next_slots(x.shape[1]) if cache is not None else None
-    for i, layer in enumerate(layers):
-        x = layer(x, rotary, mask, cache.layers[i] if cache is not None else None, slots)
-    if cache is not None:
-        cache.length += x.shape[1]
-    return x
 
 
 class LlamaModel(nn.Module):
@@ -116,8 +100,15 @@ class LlamaModel(nn.Module):
         self.norm = nn.RMSNorm(language.hidden_size, eps=language.rms_norm_eps)
 
     def forward(self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: Seen = None) -> Tensor:
-        mask = attention_mask(seen, x.shape[1], cache, x)
-        return self.norm(run_layers(self.layers, self.language, x, positions, cache, mask))
+        language, tokens = self.language, x.shape[1]
+        mask = attention_mask(seen, tokens, cache, x)
+        rotary = rotation(positions, language.channels, language.rope_theta, x.dtype)
+        slots = cache.next_slots(tokens) if cache is not None else None
+        for i, layer in enumerate(self.layers):
+            x = layer(x, rotary, mask, cache.layers[i] if cache is not None else None, slots)
+        if cache is not None:
+            cache.length += tokens
+        return self.norm(x)
 
 
 class LanguageModel(nn.Module):
