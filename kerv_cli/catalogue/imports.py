@@ -22,7 +22,7 @@ from kerv_cli.lab import database as tables
 from kerv_cli.lab.database import FILE, MEASURES, SCHEMA, Database, file_url, measures_in, other_schema
 from kerv_cli.lab.plan import Episode
 from kerv_cli.lab.runs import Run
-from kerv_cli.lab.store import Study, stored_settings, write_episode
+from kerv_cli.lab.store import Study, planned_episodes, stored_settings, write_episode
 from kerv_cli.worlds.demos.files import foreign_table
 
 _DAMAGE = (sa.exc.SQLAlchemyError, sqlite3.Error, pa.ArrowException, OSError, ValueError, KeyError, TypeError,
@@ -121,7 +121,8 @@ def _in_database(path: Path, database: Database, name: str, stack: contextlib.Ex
 
 
 def _stored(connection: sa.Connection, path: Path, row: Any, database: Database, name: str = "") -> Found:
-    settings, episodes = stored_settings(connection, row.id)
+    settings = stored_settings(connection, row.id)
+    episodes = planned_episodes(connection, settings)
     study = Study(database, name or row.name, row.kind, tuple(settings.values()), episodes, **row.about)
     runs = tables.RUNS.c
     newest = sa.select(runs.command).where(runs.kind == row.kind, runs.name == row.name)

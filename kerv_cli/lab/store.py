@@ -166,12 +166,8 @@ class Study:
                 "choose another study.name=NAME"
             )
 
-    def load(self) -> Study:
-        """Return the study as it was planned last.
-
-        Raises:
-            UsageError: The database has no such study. The message says which command runs it.
-        """
+    def load(self, episodes: bool = True) -> Study:
+        """Return the study as it was planned last. `episodes=False` leaves out its episodes, which take time."""
         row = self._row()
         if row is None:
             stored = [study.name for study in studies(self.database)]
@@ -179,8 +175,9 @@ class Study:
             hint = self.how_to_run() if self.name in groups()["study"] else hint
             raise UsageError(f"no study '{self.name}' in {self.database.shown}: {hint}")
         with self.database.reading() as connection, self.database.checking(f"study {self.name}"):
-            settings, episodes = stored_settings(connection, row.id)
-            return Study(self.database, self.name, row.kind, tuple(settings.values()), episodes, **row.about)
+            settings = stored_settings(connection, row.id)
+            planned = planned_episodes(connection, settings) if episodes else ()
+            return Study(self.database, self.name, row.kind, tuple(settings.values()), planned, **row.about)
 
     def counts(self) -> tuple[int, int]:
         """Return how many of the study's planned episodes have been run, and how many episodes are planned."""
@@ -438,13 +435,17 @@ def setting_of(row: Any) -> Setting:
     )
 
 
-def stored_settings(connection: sa.Connection, study: int) -> tuple[dict[int, Setting], tuple[Episode, ...]]:
-    """Return a study's settings by their ids, and its episodes. `study` is the study's row number."""
+def stored_settings(connection: sa.Connection, study: int) -> dict[int, Setting]:
+    """Return a study's settings by their ids. `study` is the study's row number."""
     query = sa.select(SETTINGS).where(SETTINGS.c.study_id == study).order_by(SETTINGS.c.position)
-    settings = {one.id: setting_of(one) for one in connection.execute(query)}
+    return {one.id: setting_of(one) for one in connection.execute(query)}
+
+
+def planned_episodes(connection: sa.Connection, settings: Mapping[int, Setting]) -> tuple[Episode, ...]:
+    """Return the episodes of `stored_settings`, in the study's order."""
     wanted = sa.select(WANTED.c.setting_id, WANTED.c.task, WANTED.c.seed)
     wanted = wanted.where(WANTED.c.setting_id.in_(settings)).order_by(WANTED.c.position)
-    return settings, tuple(Episode(settings[number], *rest) for number, *rest in connection.execute(wanted))
+    return tuple(Episode(settings[number], *rest) for number, *rest in connection.execute(wanted))
 
 
 def studies(database: Database) -> list[Study]:
