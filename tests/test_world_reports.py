@@ -82,13 +82,28 @@ def test_the_figure_has_a_panel_per_kind_and_a_line_per_method(stressed_results)
 
 def test_the_verdict_says_who_falls_behind_where(stressed_results):
     behind, is_shown, _ = verdict_of(stressed_results, 3.0)
-    assert "less successful than ar: bold, kind=light level=4. More successful: no setting" in behind
+    assert "less successful than the baseline: bold, kind=light level=4 (than ar, kind=light level=4). More" in behind
     assert not is_shown
     kept = [row for row in stressed_results if (row.stress, row.stress_level) != ("light", 4)]
-    assert "less successful than ar: no setting" in verdict_of(kept, 3.0)[0]
+    assert "less successful than the baseline: no setting. More successful: no setting" in verdict_of(kept, 3.0)[0]
     counts = PairedCounts(0, 2, 0, 38)
     unsolved = [replace(row, measures=replace(row.measures, counts=counts)) for row in stressed_results]
     assert "nothing is compared: ar; ar, kind=push level=1" in verdict_of(unsolved, 3.0)[0]
+
+
+def test_with_two_clocks_the_verdict_names_the_label_of_each_baseline(tmp_path):
+    settings: dict[str, RolloutSettings] = {}
+    for label in ("mine, waits", "mine, real", "bold, waits", "bold, real"):
+        settings[label] = settings_of("ar", 9 * label.startswith("bold"), EPISODES)
+        settings[label].rollout.clock = label.split()[1]
+
+    def run(setting: Setting, task: str) -> RunEpisode:
+        return lambda seed: replace(episode(setting, task, seed), success=setting.label != "bold, real")
+
+    study = study_of(settings, ["reach-v3"], "clocks", title="", axis="", baseline="mine, waits")
+    results = load_study(swept(tmp_path, study, run)[0]).results
+    said = verdict_of(results, 3.0).sentence
+    assert "less successful than the baseline: bold, real (than mine, real). More successful: no setting" in said
 
 
 def test_the_shipped_study_has_every_method_under_every_kind_and_level():

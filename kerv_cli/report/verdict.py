@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from operator import attrgetter
 from typing import NamedTuple
 
 from kerv_cli.base.durations import count
@@ -206,7 +205,6 @@ def _missing(choice: Choice) -> str:
 
 
 def under_conditions(rows: Sequence[Result]) -> str:
-    method = next(filter(attrgetter("is_baseline"), rows)).method
     less, more = [], []
     failing: dict[str, None] = {}
     for row in rows:
@@ -216,11 +214,11 @@ def under_conditions(rows: Sequence[Result]) -> str:
         if (counts.both + counts.only_baseline) / row.measures.pairs < SOLVED:
             failing[row.baseline] = None
         elif difference.high < 0:
-            less.append(row.label)
+            less.append(f"{row.label} (than {row.baseline})")
         elif difference.low > 0:
-            more.append(row.label)
+            more.append(f"{row.label} (than {row.baseline})")
     text = (
-        f"under the same conditions, with 95 % confidence each, less successful than {method}: "
+        "under the same conditions, with 95 % confidence each, less successful than the baseline: "
         f"{'; '.join(less) or 'no setting'}. More successful: {'; '.join(more) or 'no setting'}"
     )
     return text + (f". These do not solve the tasks, nothing is compared: {'; '.join(failing)}" if failing else "")
