@@ -36,9 +36,6 @@ MOST_VALUES = 20_000
 MOST_BYTES = 2**36
 """Maximum size of a file of weights or of a table in bytes."""
 
-OTHER_HOSTS_STALE_HOURS = 7 * 24.0
-"""After this many hours a temporary file of another machine counts as left over by a killed process."""
-
 CLOCKS_DIFFER_SECONDS = 3600.0
 """The clock of a network folder may be this many seconds behind this machine's clock."""
 
@@ -366,26 +363,25 @@ def _sha256(path: str, inode: int, size: int, changed: int) -> str:
 
 def temporary_beside(path: Path) -> Path:
     """Return a new temporary path in the same folder as `path`. Its name contains this machine and process."""
-    mark = f"{socket.gethostname().replace('.', '-')}.{os.getpid()}-{secrets.token_hex(4)}"
+    mark = f"{_host()}.{os.getpid()}-{secrets.token_hex(4)}"
     name = path.name.encode()[:150].decode(errors="ignore")
     return path.with_name(f".{name}.{mark}.tmp")
 
 
-def is_left_over(path: Path) -> bool:
-    """Return whether `path` has a temporary name and the process that wrote it has ended.
+def _host() -> str:
+    return socket.gethostname().replace(".", "-")
 
-    A file of another machine counts as left over once it is older than OTHER_HOSTS_STALE_HOURS.
-    """
+
+def is_left_over(path: Path) -> bool:
+    """Return whether a process of this machine has left `path`, a temporary file or folder, and has ended."""
     match = _TEMPORARY.fullmatch(path.name)
-    if match is None:
+    if match is None or match["host"] != _host():
         return False
     try:
         written = path.stat().st_mtime
     except OSError:  # it was renamed or removed meanwhile
         return False
-    if match["host"] == socket.gethostname().replace(".", "-"):
-        return not is_alive(int(match["pid"]), written + CLOCKS_DIFFER_SECONDS)
-    return time.time() - written > 3600 * OTHER_HOSTS_STALE_HOURS
+    return not is_alive(int(match["pid"]), written + CLOCKS_DIFFER_SECONDS)
 
 
 def clean(folder: Path) -> list[Path]:
