@@ -23,7 +23,7 @@ import kerv_cli as library
 from kerv_cli.base.errors import EpisodeError, KervError
 from kerv_cli.base.spaces import Observation
 from kerv_cli.base.wire import packed, unpacked
-from kerv_cli.episodes import remote
+from kerv_cli.episodes import policy, remote
 from kerv_cli.episodes.interface import Interface, Picture, read_interface
 from kerv_cli.episodes.remote import RemoteDecoder, close_servers
 from kerv_cli.methods.settings import PolicySettings
@@ -229,6 +229,27 @@ def test_a_server_that_comes_back_is_found_again_and_one_that_does_not_ends_its_
     assert output.count("failed:") == 2
     assert output.count("success,") == 2
     assert "cannot be reached (Connection refused)" in output
+
+
+@pytest.mark.parametrize(("away", "failed"), [(3, 0), (1000, 2)])
+def test_a_server_that_is_away_when_a_block_begins_is_awaited(away, failed, tmp_path, monkeypatch):
+    tries, connect = [], remote.Server.connect
+
+    def late(server):
+        if len(tries) < away and begun:
+            tries.append(server)
+            raise remote.Lost(f"{server.url} is away")
+        return connect(server)
+
+    begun: list[Any] = []
+    monkeypatch.setattr(remote, "RECONNECT_S", 1.0)
+    monkeypatch.setattr(remote.Server, "connect", late)
+    monkeypatch.setattr("kerv_cli.lab.work.check", lambda *given: begun.append(given) or policy.check(*given))
+    with serving() as url:
+        output = sweep(tmp_path, url, code=int(failed > 0))
+    assert f"{2 - failed} run, 0 reused, {failed} failed" in output
+    assert ("is away, for 1 s" in output) == bool(failed)
+    assert len(tries) >= 3
 
 
 def test_without_a_server_one_line_says_so_within_ten_seconds(tmp_path, monkeypatch):

@@ -46,8 +46,12 @@ def artifacts_of(settings: MethodSettings) -> Artifacts:
     return Artifacts(settings.results, settings.policy, settings.datastore, device, settings.runtime.dtype)
 
 
-def check(settings: RolloutSettings) -> dict[str, str]:
+def check(settings: RolloutSettings, is_awaited: bool = False) -> dict[str, str]:
     """Refuse settings that cannot run, before anything slow starts.
+
+    Args:
+        settings: The settings.
+        is_awaited: Whether to wait two minutes for a server that does not answer.
 
     Returns:
         What determines the results, apart from the settings: hashes of files with weights or data, by the kind of file.
@@ -66,7 +70,7 @@ def check(settings: RolloutSettings) -> dict[str, str]:
         _check_undecoded(settings)
         _check_clock(settings, spec, None)
     if settings.policy.kind == REMOTE:
-        return _check_remote(settings, spec)
+        return _check_remote(settings, spec, is_awaited)
     if settings.policy.kind == EXPERT:
         spec.check_experts(tasks)
         experts = ";".join(f"{task} {spec.experts[task]}" for task in sorted(tasks) if task in spec.experts)
@@ -101,9 +105,9 @@ def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
     spec.seeds.check(seeds, purpose, f"seed={settings.seed} episodes={settings.episodes}")
 
 
-def _check_remote(settings: RolloutSettings, spec: EnvironmentSpec) -> dict[str, str]:
+def _check_remote(settings: RolloutSettings, spec: EnvironmentSpec, is_awaited: bool) -> dict[str, str]:
     """Ask the server what it serves. Return what determines its results, see `check`."""
-    metadata = metadata_of(settings.policy.url)
+    metadata = metadata_of(settings.policy.url, is_awaited)
     interface = read_interface(settings.policy.interface).adapted(metadata, settings.policy.execute)
     interface.check(spec, settings.world)
     server = sha256(packed({"name": settings.policy.target, "metadata": metadata}))

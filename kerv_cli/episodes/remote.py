@@ -102,21 +102,27 @@ class Server:
 
     def find(self, since: float) -> None:
         """Connect, and try again until RECONNECT_S after `since` (of time.monotonic) if the server was there before."""
-        patience = RECONNECT_S if self.metadata and not self._given_up else 0.0
+        try:
+            metadata = self.reached(since, RECONNECT_S if self.metadata else 0.0)
+        except Lost as error:
+            raise EpisodeError(str(error)) from error
+        if metadata != self.metadata:
+            raise KervError(f"{self.url} serves another policy now: its metadata has changed")
+
+    def reached(self, since: float, patience: float) -> Message:
+        """Connect, for `patience` seconds after `since` unless that was in vain before. Return the metadata."""
+        patience = 0.0 if self._given_up else patience
         waits = _Waits(f"looking for {self.url} again", since)
         while True:
             try:
-                metadata = self.connect()
-                break
+                return self.connect()
             except Lost as error:
                 if time.monotonic() - since >= patience:
                     self._given_up = True
                     gone = f", for {patience:g} s" if patience else ""
-                    raise EpisodeError(f"{error}{gone}") from error
+                    raise Lost(f"{error}{gone}") from error
                 waits.say()
                 time.sleep(min(1.0, RECONNECT_S / 10))
-        if metadata != self.metadata:
-            raise KervError(f"{self.url} serves another policy now: its metadata has changed")
 
     def ask(self, message: Message) -> Message:
         """Return the answer to a message. Raise Lost if the connection ends before."""
@@ -221,11 +227,14 @@ def close_servers() -> None:
         _servers.popitem()[1].close()
 
 
-def metadata_of(url: str) -> Message:
-    """Return what a server says about its policy now. Decoders of the same policy connect again when they ask."""
+def metadata_of(url: str, is_awaited: bool = False) -> Message:
+    """Return what a server says about its policy now. Decoders of the same policy connect again when they ask.
+
+    A server that is awaited, because it was there when a study was planned, may be away for RECONNECT_S.
+    """
     server = server_at(url)
     try:
-        metadata = server.connect()
+        metadata = server.reached(time.monotonic(), RECONNECT_S) if is_awaited else server.connect()
     finally:
         server.close()
     if metadata != server.metadata:
