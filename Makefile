@@ -41,8 +41,8 @@ papers: setup ## train the policy of the papers' study by the commands of docs/t
 torture: setup ## kill commands, break their disk, damage their files, at random (MINUTES=1)
 	@$(BIN)/python -m pytest -s tests/reliability/torture.py
 
-trials: setup ## kill, stop and continue sweeps and workers at random (TRIALS=200)
-	@$(BIN)/python tests/reliability/trials.py $${TRIALS:-200}
+trials: setup ## kill, stop and continue sweeps and workers at random (TRIALS=200 FIRST=0)
+	@$(BIN)/python tests/reliability/trials.py $${TRIALS:-200} $${FIRST:-0}
 
 lint: setup ## check style, types, and that rooms import only what lies below
 	@$(BIN)/ruff check $(CODE)

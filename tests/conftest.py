@@ -7,10 +7,7 @@ import os
 import secrets
 import shutil
 import signal
-import socket
-import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -23,6 +20,7 @@ from typing import Any
 import examples.insertion  # noqa: F401 - registers the environment with seven degrees of freedom
 import hypothesis
 import pytest
+import server
 
 from kerv_cli.base import registry
 from kerv_cli.base.errors import KervError
@@ -258,28 +256,11 @@ def raising(error: BaseException, label: str = "", seeds: Sequence[int] = ()) ->
 @pytest.fixture(scope="session")
 def postgresql():
     """URL of a PostgreSQL server for this session, without the name of a database."""
-    programs = sorted(Path("/usr/lib/postgresql").glob("*/bin"))
-    if not programs:
-        pytest.skip("no PostgreSQL here: apt-get install postgresql")
-    user: dict[str, Any] = {"user": 65534, "group": 65534, "extra_groups": []} if os.geteuid() == 0 else {}  # nobody
-    with tempfile.TemporaryDirectory(prefix="kerv-postgresql-") as folder, socket.socket() as free:
-        if user:
-            os.chown(folder, user["user"], user["group"])
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-        free.close()
-
-        def run(program, *words):
-            command = [programs[-1] / program, "-D", f"{folder}/data", *words]
-            subprocess.run(command, check=True, cwd=folder, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, **user)
-
-        run("initdb", "-U", "kerv", "-A", "trust", "-E", "UTF8", "--locale=C", "--no-sync")
-        listening = f"-p {port} -c listen_addresses=127.0.0.1 -c unix_socket_directories= -c fsync=off"
-        run("pg_ctl", "start", "-w", "-l", f"{folder}/log", "-o", listening)
-        try:
-            yield f"postgresql://kerv@127.0.0.1:{port}"
-        finally:
-            run("pg_ctl", "stop", "-w", "-m", "immediate")
+    try:
+        with server.running() as url:
+            yield url
+    except FileNotFoundError as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

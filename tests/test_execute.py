@@ -41,7 +41,7 @@ from kerv_cli.lab.database import EPISODES, UNFINISHED, WANTED, WORKERS, Databas
 from kerv_cli.lab.follow import TimeLeft, begun
 from kerv_cli.lab.plan import blocks_of
 from kerv_cli.lab.presence import Presence
-from kerv_cli.lab.queue import ClaimLost, Queue
+from kerv_cli.lab.queue import MOST_DEATHS, ClaimLost, Queue
 from kerv_cli.lab.store import Study
 from kerv_cli.lab.study import save
 from kerv_cli.lab.work import (
@@ -366,6 +366,26 @@ def test_a_claim_lasts_as_long_as_its_heartbeat(database, silent, is_held, monke
     else:
         with pytest.raises(ClaimLost):
             first.begin(claim.block.episodes[0])
+
+
+def test_a_worker_that_was_silent_did_not_die_in_its_episode(database, present, monkeypatch):
+    monkeypatch.setattr("kerv_cli.lab.presence.BEAT_SECONDS", 1000.0)
+    store, late = waiting(database, STUDY), []
+
+    def taken(setting, task):
+        def run(seed):
+            silence(database)
+            late.append(present(store).claim())
+            return episode(setting, task, seed)
+
+        return run
+
+    for number in range(1, MOST_DEATHS + 2):
+        with Presence(database) as here:
+            work(Queue(store, here.worker), taken, is_done=lambda number=number: len(late) == number)
+        silence(database)
+    ran(store)
+    assert (errors(database), store.counts()) == ([], (16, 16))
 
 
 def test_no_two_workers_run_an_episode_that_two_studies_share(database, present):

@@ -179,6 +179,12 @@ class Queue:
                 self._change(connection, before, attempts=WANTED.c.attempts - 1)
             self._change(connection, one, attempts=WANTED.c.attempts + 1)
 
+    def survive(self, one: Episode) -> None:
+        """Take back that this worker died in an episode which another worker has claimed meanwhile."""
+        with self.database.writing() as connection:
+            counted = sa.update(WANTED).where(self._rows(one), UNFINISHED, WANTED.c.attempts > 0)
+            connection.execute(counted.values(attempts=WANTED.c.attempts - 1))
+
     def write(
         self, one: Episode, block: Mapping[str, Any], row: Mapping[str, Any], decodes: bytes, then: Episode | None
     ) -> None:

@@ -164,22 +164,13 @@ def work_on(study: Study, run: str, on_event: OnEvent, save: Save) -> None:
         close_worlds()
 
 
-def checked(setting: Setting, tasks: list[str], results: str) -> Setting:
+def checked(setting: Setting, tasks: list[str], results: str, is_awaited: bool = False) -> Setting:
     """Check that the weights and data that a stored setting uses are still the same.
 
-    Args:
-        setting: The stored setting.
-        tasks: Names of the tasks on which it will run.
-        results: The results folder in which it will run.
-
-    Returns:
-        The setting, changed to run in `results`.
-
-    Raises:
-        CheckpointError: The weights or data of the setting have changed.
+    Return the setting, changed to run in the folder `results`. `is_awaited` is explained in `policy.check`.
     """
     here = replace(setting, settings={**setting.settings, "results": results})
-    identity = check(here.on(*tasks))
+    identity = check(here.on(*tasks), is_awaited)
     for kind in setting.identity.keys() | identity.keys():
         before, after = setting.identity.get(kind, "none"), identity.get(kind, "none")
         if kind != OBSERVATION and before != after:
@@ -297,8 +288,9 @@ class _Attempt:
                     self._fail(one, failure_of(error))
                 else:
                     self._end(one, record, order, started)
-        except ClaimLost:
-            return
+        except ClaimLost:  # another worker has it, because this one was silent for too long: it did not die
+            if self.running is not None:
+                patiently(self.queue.survive, self.running)
 
     def _begin(self, one: Episode) -> None:
         """Note that an episode, or the preparation of its setting, begins, unless that is noted."""
@@ -421,7 +413,7 @@ def _loaded(setting: Setting, tasks: list[str], load: Callable[[], T]) -> T:
         CheckpointError: They have changed since the study was planned.
     """
     results = str(setting.settings["results"])
-    checked(setting, tasks, results)
+    checked(setting, tasks, results, is_awaited=True)
     loaded = load()
-    checked(setting, tasks, results)
+    checked(setting, tasks, results, is_awaited=True)
     return loaded

@@ -1,7 +1,7 @@
 """Seeded trials of the queue: sweeps and workers that are killed, stopped and continued while others plan and remove.
 
-`python tests/reliability/trials.py 200 [SEED] [postgresql://USER@HOST:PORT]` runs trials by hand;
-`tests/test_reliability.py` runs twenty. An episode is a function here: no world, no model.
+`make trials` runs 200, the odd ones in PostgreSQL; `tests/test_reliability.py` runs twenty. An episode is a function
+here: no world, no model.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+import server
 import sqlalchemy as sa
 import studies_synthetic as synthetic
 
@@ -41,7 +42,7 @@ PATIENCE = 60.0
 """Seconds until an actor that is left in peace has to end."""
 LAPSE, BEAT = 0.6, 0.15
 QUIET = 10.0
-"""Longest silence of a sweep on an idle machine, seconds."""
+"""Longest silence of a sweep, seconds."""
 CLONE_NEWPID = 0x20000000
 MAIN, OTHER = "threshold", "other"
 
@@ -72,6 +73,7 @@ class Trial:
         self.log: list[str] = []
         self.reruns = 0
         self.stopped: set[int] = set()
+        self.deaths = 0
         self.weights = results / "weights"
         results.mkdir(parents=True, exist_ok=True)
         self.weights.write_text("planned")
@@ -159,7 +161,7 @@ class Trial:
             failed = sum(len(failure.episodes) for failure in outcome.failed)
             told = {"study": study.name, "planned": len(study.episodes), "done": len(outcome.done),
                     "reused": len(outcome.reused), "failed": failed, "quiet": quiet, "pid": os.getpid()}  # fmt: skip
-            trial._tell("sweep", told)
+            trial._tell("sweep", told | {"reasons": [failure.reason for failure in outcome.failed]})
 
         return job
 
@@ -222,6 +224,7 @@ class Trial:
             self.log.append(f"{time.monotonic():.2f} {kind} {actor.name}")
             number = {"kill": signal.SIGKILL, "stop": signal.SIGSTOP, "interrupt": signal.SIGINT}[kind]
             actor.codes |= {"kill": {-9, 137}, "stop": set(), "interrupt": {130}}[kind]
+            self.deaths += kind == "kill" or (kind == "stop" and not actor.is_stopped)
             if kind == "stop":
                 os.kill(actor.pid, signal.SIGCONT if actor.is_stopped else number)
                 self.stopped.add(actor.pid)
@@ -285,9 +288,10 @@ class Trial:
                 wrong.append(told["error"])
             if "planned" in told and told["done"] + told["reused"] + told["failed"] != told["planned"]:
                 wrong.append(f"counts do not add up: {told}")
-            load = max(1.0, os.getloadavg()[0])
-            if told.get("quiet", 0.0) > QUIET * load and told["pid"] not in self.stopped:
+            if told.get("quiet", 0.0) > QUIET and told["pid"] not in self.stopped:
                 wrong.append(f"nothing was said for {told['quiet']:.1f} s")
+            if self.deaths < queue.MOST_DEATHS and any("workers died" in why for why in told.get("reasons", ())):
+                wrong.append(f"{self.deaths} workers were killed or stopped, more were counted: {told}")
         self.weights.write_text("planned")
         for study in (base, other):
             self.begin("last", self.sweep(study))
@@ -324,30 +328,32 @@ class Trial:
         return wrong
 
 
-def trial(seed: int, server: str = "") -> list[str]:
+def trial(seed: int, url: str = "") -> list[str]:
     """Run a trial, in SQLite or in a new database of a PostgreSQL server. Return what is wrong, and what happened."""
     with tempfile.TemporaryDirectory(prefix="kerv-trial-") as folder, contextlib.ExitStack() as stack:
         store = ""
-        if server:
+        if url:
             import psycopg
 
-            store = f"{server}/kerv_{secrets.token_hex(4)}"
-            connection = stack.enter_context(psycopg.connect(f"{server}/postgres", autocommit=True))
+            store = f"{url}/kerv_{secrets.token_hex(4)}"
+            connection = stack.enter_context(psycopg.connect(f"{url}/postgres", autocommit=True))
             connection.execute(f"CREATE DATABASE {store.rpartition('/')[2]}")
             stack.callback(connection.execute, f"DROP DATABASE {store.rpartition('/')[2]} WITH (FORCE)")
         one = Trial(seed, Path(folder) / "results", store)
         wrong = one.run()
-        return [f"seed {seed}", *wrong, *one.log] if wrong else []
+        return [*wrong, *one.log] if wrong else []
 
 
 def main() -> None:
-    """Run trials by hand. Say which seeds failed."""
-    number, first = int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0
-    server, failed = sys.argv[3] if len(sys.argv) > 3 else "", []
-    for seed in range(first, first + number):
-        if wrong := trial(seed, server):
-            failed.append(seed)
-            print(*wrong, sep="\n  ", flush=True)
+    """Run trials: `trials.py NUMBER [FIRST]`. Print a line per trial, and what went wrong."""
+    number, first, failed = int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0, []
+    with server.running() as url:
+        for seed in range(first, first + number):
+            began = time.monotonic()
+            wrong = trial(seed, url if seed % 2 else "")
+            failed += [seed] if wrong else []
+            where, end = "PostgreSQL" if seed % 2 else "SQLite", "FAILED" if wrong else "well"
+            print(f"seed {seed} {where}: {end}, {time.monotonic() - began:.0f} s", *wrong, sep="\n  ", flush=True)
     print(f"{number - len(failed)} of {number} trials went well; failed: {failed}")
     sys.exit(bool(failed))
 
