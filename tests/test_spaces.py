@@ -1,9 +1,11 @@
 """Action spaces: round trips of tokens, groups, statistics; names, instructions and suites of the tasks."""
 
 import json
+import math
 import re
 from collections import Counter
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from hypothesis import strategies as st
 
 from kerv_cli.base.codes import FastCode
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
+from kerv_cli.base.limits import number
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace
 from kerv_cli.targets.compact.features import PAD, UNKNOWN, WordTokenizer
@@ -82,6 +85,48 @@ def test_a_space_survives_its_json_and_a_damaged_one_gets_one_line():
     for value in wrong:
         with refused("an action space is damaged", error=CheckpointError):
             read(ActionSpace, value, "an action space")
+
+
+@dataclass(frozen=True)
+class Inner:
+    share: float
+    note: str | None = None
+
+
+@dataclass(frozen=True)
+class Outer:
+    kind: Literal["outer"]
+    pair: tuple[int, float]
+    every: tuple[Inner, ...] = ()
+    by_name: dict[str, list[float]] = field(default_factory=dict)
+    count: int = number(1, 1, 9)
+
+
+def test_a_description_is_converted_field_by_field():
+    value = {"kind": "outer", "pair": [1, 2], "every": [{"share": 1, "note": None}], "by_name": {"a": [1, 0.5]}}
+    whole = Outer("outer", (1, 2.0), (Inner(1.0),), {"a": [1.0, 0.5]})
+    assert read(Outer, value, "it") == whole
+    assert read(Outer, {**value, "more": 1}, "it", tolerant=True) == whole
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"kind": "inner"}, "kind: 'inner' is no"),
+        ({"pair": [1]}, "pair: '[1]' is no"),
+        ({"pair": [True, 1.0]}, "pair.0: 'True' is no int"),
+        ({"pair": [1, math.inf]}, "pair.1: inf is not finite"),
+        ({"every": [{}]}, "every.0.share: field required"),
+        ({"every": [{"share": 1.0, "more": 1}]}, "every.0.more: unknown field"),
+        ({"every": [{"share": 1.0, "note": 2}]}, "every.0.note: '2' is no str"),
+        ({"by_name": {"a": [math.nan]}}, "by_name.a.0: nan is not finite"),
+        ({"by_name": {"a": "x"}}, "by_name.a: 'x' is no"),
+        ({"count": 10}, "count=10: from 1 to 9"),
+    ],
+)
+def test_a_wrong_field_is_named_with_the_file(changes, says):
+    with refused(f"FILE is damaged: {says}", error=CheckpointError):
+        read(Outer, {"kind": "outer", "pair": [1, 2.0]} | changes, "FILE")
 
 
 def test_what_was_made_for_other_actions_is_refused_by_the_first_difference():

@@ -5,9 +5,12 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from kerv_cli.base.errors import CheckpointError, KervError
 from kerv_cli.base.files import read_mapping, sha256_of
@@ -19,51 +22,69 @@ DIGEST = "digest"
 """Field of a JSON file with the SHA-256 of all its other fields, sorted by name, as compact JSON."""
 
 
-@functools.cache
-def _adapter(kind: Any) -> Any:
-    from pydantic import TypeAdapter
-
-    # pydantic applies it to the dataclasses inside, too
-    setattr(kind, "__pydantic_config__", {"allow_inf_nan": False})  # noqa: B010
-    return TypeAdapter(kind)
-
-
 def read(kind: type[T], value: Any, what: str, tolerant: bool = False) -> T:
-    """Convert a JSON value to a dataclass, whose fields may be dataclasses, too.
+    """Convert a JSON value to a dataclass, whose fields may be dataclasses, too. `what` names the value in errors.
 
-    Args:
-        kind: The dataclass.
-        value: The JSON value.
-        what: Name of the value in the error message, such as its file.
-        tolerant: Whether to ignore unknown fields, which a newer version of kerv may have written. Otherwise they are
-            an error.
-
-    Raises:
-        CheckpointError: A field is missing, unknown, of a wrong type or out of range. The message names the first such
-            field.
+    With `tolerant`, unknown fields, which a newer version of kerv may have written, are ignored, else an error.
     """
-    from pydantic import ValidationError
-
     try:
-        adapter: Any = _adapter(kind)  # type: ignore[arg-type]
-        checked: T = adapter.validate_python(value, extra="ignore" if tolerant else "forbid")
+        checked: T = _converted(kind, value, "", tolerant)
         check_settings(checked)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"])) or "the whole"
-        raise CheckpointError(f"{what} is damaged: {where}: {first['msg'].lower()}") from error
     except KervError as error:  # from the dataclass's own checks, or from check_settings
         raise CheckpointError(f"{what} is damaged: {error}") from error
     return checked
 
 
-def read_file(kind: type[T], path: Path) -> T:
-    """Read a JSON file into a dataclass. Unknown fields are ignored.
+def _converted(kind: Any, value: Any, place: str, tolerant: bool) -> Any:
+    # `place` is the keys that lead to the value, such as "tasks.reach-v3."
+    origin, args = get_origin(kind), get_args(kind)
+    if kind is Any or (value is None and NoneType in args) or type(value) is kind:
+        return value if kind is not float else _finite(value, place)
+    if kind is float and type(value) is int:
+        return float(value)
+    if origin is UnionType:
+        return _converted(next(one for one in args if one is not NoneType), value, place, tolerant)
+    if origin is Literal and value in args:
+        return value
+    if isinstance(value, Mapping):
+        if is_dataclass(kind):
+            return _instance(kind, value, place, tolerant)
+        if origin in (dict, Mapping):
+            return {key: _converted(args[1], one, f"{place}{key}.", tolerant) for key, one in value.items()}
+    if isinstance(value, list | tuple) and origin in (list, tuple):
+        kinds = args if origin is tuple and args[-1] is not Ellipsis else args[:1] * len(value)
+        if len(kinds) == len(value):
+            every = enumerate(zip(kinds, value, strict=True))
+            return origin(_converted(one, item, f"{place}{i}.", tolerant) for i, (one, item) in every)
+    raise KervError(f"{place[:-1]}: {str(value)[:40]!r} is no {getattr(kind, '__name__', kind)}".removeprefix(": "))
 
-    Raises:
-        CheckpointError: The file is missing or not JSON, its content has another hash than it names, or a field is
-            missing, of a wrong type or out of range.
-    """
+
+def _finite(value: float, place: str) -> float:
+    if not math.isfinite(value):
+        raise KervError(f"{place[:-1]}: {value} is not finite")
+    return value
+
+
+def _instance(kind: Any, value: Mapping[str, Any], place: str, tolerant: bool) -> Any:
+    hints, given = _hints(kind), dict[str, Any]()
+    for at in fields(kind):
+        if at.name in value:
+            given[at.name] = _converted(hints[at.name], value[at.name], f"{place}{at.name}.", tolerant)
+        elif at.default is MISSING and at.default_factory is MISSING:
+            raise KervError(f"{place}{at.name}: field required")
+    for name in value.keys() - given.keys() if not tolerant else ():
+        raise KervError(f"{place}{name}: unknown field")
+    try:
+        return kind(**given)
+    except (KervError, ValueError) as error:
+        raise KervError(f"{place[:-1]}: {error}".removeprefix(": ")) from error
+
+
+_hints = functools.cache(get_type_hints)
+
+
+def read_file(kind: type[T], path: Path) -> T:
+    """Read a JSON file into a dataclass. Unknown fields are ignored."""
     value = read_mapping(path)
     digest = value.pop(DIGEST, None)  # files of before version 1.1 have none
     if digest is not None and digest != _digest_of(value):
@@ -81,7 +102,7 @@ def _digest_of(fields: Mapping[str, Any]) -> str:
 
 
 def content_of(key: Sequence[str], chunk: int, target: str, files: Mapping[str, str]) -> str:
-    """Return the hexadecimal SHA-256 of the four arguments. They determine what a datastore finds (docs/formats.md).
+    """Return the SHA-256 that determines what a datastore finds (docs/formats.md).
 
     Args:
         key: Parts of the prompt that form the search keys.
@@ -94,16 +115,7 @@ def content_of(key: Sequence[str], chunk: int, target: str, files: Mapping[str, 
 
 
 def check_files(folder: Path, files: Mapping[str, str], again: str) -> None:
-    """Check that the files in a folder have the hashes that the folder's manifest names.
-
-    Args:
-        folder: The folder.
-        files: SHA-256 of each file, by name.
-        again: What the user should do if a file has changed, text for the error message.
-
-    Raises:
-        CheckpointError: A file is missing or changed.
-    """
+    """Check that files have their SHA-256. `again` says in the error message what to do if one has changed."""
     for name, digest in files.items():
         if sha256_of(folder / name) != digest:
             raise CheckpointError(f"{folder / name} does not match its manifest: {again}")
