@@ -60,6 +60,9 @@ def test_the_command_names_a_function_that_the_wheel_holds(wheel):
 def test_the_requirements_keep_the_physics_engine_that_results_depend_on(metadata):
     requirements = metadata.get_all("Requires-Dist") or []
     assert "mujoco==3.3.0" in requirements
+    assert any(line.startswith("rerun-sdk") and "extra" not in line for line in requirements), (
+        "recording needs no extra"
+    )
     assert any(line.startswith("metaworld") and ">=3.1.1" in line for line in requirements)
 
 
@@ -245,7 +248,7 @@ def test_the_lock_files_hold_a_hash_of_every_requirement(metadata):
             requirement = Requirement(line)
             pinned[canonicalize_name(requirement.name)] = str(requirement.specifier).removeprefix("==")
     assert locked("cpu", "torch") == f"torch=={pinned['torch']}+cpu"
-    extras = {"lerobot", "openvla", "postgres", "serve", "viewer", "dev", ""}
+    extras = {"lerobot", "openvla", "postgres", "serve", "dev", ""}
     for requirement in map(Requirement, metadata.get_all("Requires-Dist") or []):
         if requirement.name != "kerv" and any(
             requirement.marker is None or requirement.marker.evaluate({"extra": extra}) for extra in extras

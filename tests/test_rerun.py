@@ -1,6 +1,5 @@
 """Recordings read back from disk: entities, timelines, values, layout, and what a failure leaves behind."""
 
-import html
 import os
 import shlex
 import sys
@@ -11,17 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command import kerv, refusal
 from conftest import refused
 from examples.insertion import SPEC as INSERTION
 from rerun.chunk import RrdReader
 from rerun_synthetic import DOFS, decode_of, episode, prefill, read_recording, verify
-from starlette.testclient import TestClient
 
 from kerv_cli.base.errors import KervError, StorageError, UsageError
-from kerv_cli.board.app import make_app
 from kerv_cli.engine.record import EpisodeRecord, Round
-from kerv_cli.lab.database import opened
 from kerv_cli.report.viewing import save_recording, viewer
 from kerv_cli.report.viewing.token_outcomes import chunk_size, outcomes_of, readable
 from kerv_cli.report.viewing.viewer import MOST_OPENED, find_recordings, open_recording, read_chunks
@@ -263,24 +258,3 @@ def test_the_viewer_is_started_and_left_alone_or_says_why_not(tmp_path, monkeypa
     program.write_text(f'#!/bin/sh\necho "$@" > {asked}; sleep 0.6\n')
     assert open_recording([path]) == "opened episode.rrd in the Rerun viewer"
     assert asked.read_text().split() == ["--bind", "127.0.0.1", str(path)]
-
-
-def test_without_rerun_all_runs_but_recordings(policies, tmp_path, monkeypatch):
-    (tmp_path / "artifacts").symlink_to(policies / "artifacts")
-    path = saved(episode("ar", horizon=4), tmp_path)
-    monkeypatch.setitem(sys.modules, "rerun", None)  # as if it were not installed
-    words = [
-        "rollout",
-        "method=ar",
-        "task=reach",
-        "policy=state",
-        "policy.target=nano-state",
-        "episodes=1",
-        "world.horizon=4",
-    ]
-    kerv(*words, "record=0", f"results={tmp_path}")
-    missing = "kerv: recordings need Rerun: pip install 'kerv[viewer]'"
-    assert refusal(*words, "record=1", f"results={tmp_path}", code=2) == f"{missing}, or set record=0"
-    assert refusal("view", str(path), code=1) == missing
-    with TestClient(make_app(opened(tmp_path)), base_url="http://127.0.0.1") as client:
-        assert missing.removeprefix("kerv: ") in html.unescape(client.get("/episodes/1").text)

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
-from importlib.util import find_spec
 from typing import Any
-
-NO_RERUN = "recordings need Rerun: pip install 'kerv[viewer]'"
-"""Error message if `has_rerun` is false."""
 
 
 class KervError(Exception):
@@ -22,11 +18,6 @@ class KervError(Exception):
 
 def _unpickled(kind: type[KervError], message: str) -> KervError:
     return kind.__new__(kind, message)
-
-
-def has_rerun() -> bool:
-    """Return whether Rerun is installed. It is an optional package that writes and reads recordings."""
-    return find_spec("rerun") is not None
 
 
 class UsageError(KervError):

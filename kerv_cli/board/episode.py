@@ -24,7 +24,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
-from kerv_cli.base.errors import NO_RERUN, KervError, has_rerun
+from kerv_cli.base.errors import KervError
 from kerv_cli.board.pages import CONTENT_POLICY, database_of, inside, render
 from kerv_cli.board.recorder import RECORDER
 from kerv_cli.catalogue.episodes import FoundEpisode, find_episode, outcomes
@@ -93,8 +93,8 @@ def _film_values(
 ) -> dict[str, Any]:
     job = RECORDER.job(found.recording)
     values: dict[str, Any] = {"found": found, "step": step, "job": job, "film": None, "same": None, "rerun": ""}
-    values |= {"slower": SLOWER, "missing": "" if has_rerun() else NO_RERUN}
-    if has_rerun() and found.recording.exists() and (job is None or job.future.done()):
+    values["slower"] = SLOWER
+    if found.recording.exists() and (job is None or job.future.done()):
         film = film_of(inside(request, found.recording))
         if film.facts.get("tokens"):
             values["same"] = film.facts["tokens"] == tokens_hash(found.decodes()[0] if decodes is None else decodes)

@@ -17,7 +17,6 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from kerv_cli.base.errors import NO_RERUN, UsageError, has_rerun
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.chunk import Follower
 from kerv_cli.engine.decoder import BatchDecoder
@@ -218,14 +217,8 @@ def is_recorded(settings: RolloutSettings, seed: int) -> bool:
 
     The first `settings.record` episodes of each task are recorded, or all if this number is negative. Episodes that run
     in a batch are never recorded.
-
-    Raises:
-        UsageError: The episode should be recorded, and Rerun is not installed.
     """
-    recorded = settings.rollout.batch == 1 and (settings.record < 0 or seed - settings.seed < settings.record)
-    if recorded and not has_rerun():
-        raise UsageError(f"{NO_RERUN}, or set record=0", "record")
-    return recorded
+    return settings.rollout.batch == 1 and (settings.record < 0 or seed - settings.seed < settings.record)
 
 
 def success_of(target: Target, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:

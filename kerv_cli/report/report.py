@@ -19,7 +19,7 @@ import altair as alt
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from kerv_cli.base.durations import count
-from kerv_cli.base.errors import UsageError, has_rerun
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_json, write_text
 from kerv_cli.episodes.identity import NOT_DETERMINING, without
 from kerv_cli.lab.database import Database
@@ -265,7 +265,7 @@ def _settings(data: StudyData) -> list[dict[str, Any]]:
 
 
 def _films(data: StudyData) -> list[dict[str, Any]]:
-    recorded = {path.name for path in data.study.recordings} if has_rerun() else set()
+    recorded = {path.name for path in data.study.recordings}
     outcomes = data.episodes.set_index(["label", "task", "seed"])["success"].to_dict() if recorded else {}
     films: dict[tuple[str, bool], dict[str, Any]] = {}
     for one in data.study.episodes if recorded else ():

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from PIL import Image
 
-from kerv_cli.base.errors import NO_RERUN, KervError, UsageError, has_rerun
+from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.files import regular
 
 if TYPE_CHECKING:
@@ -109,8 +109,6 @@ def _start(command: list[str]) -> None:
 
 def read_chunks(path: Path) -> tuple[RrdReader, list[Chunk]]:
     """Read a recording. Return Rerun's reader and all data chunks of the file."""
-    if not has_rerun():
-        raise KervError(NO_RERUN)
     from rerun.chunk import RrdReader
 
     with warnings.catch_warnings():
