@@ -337,7 +337,7 @@ FROM_PROFILE = "rollout.clock=real rollout.latency=profile rollout.profile=there
     ("words", "message"),
     [
         (f"{CONSTANT} rollout.latency_ms=nan", "rollout.latency_ms=nan: from 0"),
-        (f"{CONSTANT} rollout.latency_ms=6250", "500 control steps, but an episode of metaworld has 500"),
+        (f"{CONSTANT} rollout.latency_ms=6250", "500 control steps, but an episode has 500"),
         (
             f"{CONSTANT} rollout.latency_ms=50 rollout.delay_compensation=chunk",
             "all 4 control steps of a chunk are stale",

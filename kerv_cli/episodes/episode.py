@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from kerv_cli.base.errors import KervError
+from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.chunk import Follower
 from kerv_cli.engine.record import DecodeRecord, Delay, EpisodeRecord
@@ -28,15 +28,7 @@ Latency = Callable[[DecodeRecord], float]
 
 
 def steps_during(seconds: float, control_hz: float) -> int:
-    """Convert a latency to control steps, rounded up. Rounding errors just above a whole number are ignored.
-
-    Args:
-        seconds: The latency.
-        control_hz: Control steps per second.
-
-    Raises:
-        KervError: The latency is negative or not finite.
-    """
+    """Convert a latency to control steps, rounded up. Rounding errors just above a whole number are ignored."""
     if not 0 <= seconds < math.inf:
         raise KervError(f"the latency of a decode is {seconds} seconds, which cannot be")
     return math.ceil(round(seconds * control_hz, 6))
@@ -45,24 +37,31 @@ def steps_during(seconds: float, control_hz: float) -> int:
 class RealClock:
     """Tells an episode how long each decode takes, and how many of the decoded actions are then too old to execute.
 
+    A constant latency (seconds) must leave something to execute: in an episode of `horizon` control steps, and with
+    compensation in a chunk of `chunk` steps.
+
     Attributes:
         expected: Number of control steps that the next decode will probably take: as many as the last decode took.
     """
 
-    def __init__(self, latency: Latency, space: ActionSpace, compensation: str = "none") -> None:
-        self.latency, self.space, self.compensation = latency, space, compensation
-        self.expected = 0
+    def __init__(
+        self, latency: Latency | float, space: ActionSpace, compensation: str = "none", horizon: int = 0, chunk: int = 0
+    ) -> None:
+        self.space, self.compensation, self.expected = space, compensation, 0
+        self.latency: Latency = latency if callable(latency) else lambda decode: latency
+        if callable(latency):
+            return
+        late, typed = steps_during(latency, space.control_hz), f"rollout.latency_ms={1000 * latency:g}"
+        if late >= horizon:
+            raise UsageError(f"{typed}: {late} control steps, but an episode has {horizon}")
+        if compensation == CHUNK and late >= chunk:
+            raise UsageError(
+                f"{typed} with rollout.delay_compensation=chunk: all {chunk} control steps of a chunk are stale after "
+                f"{late}"
+            )
 
     def delay(self, decode: DecodeRecord, observed: int) -> Delay:
-        """Return how many control steps a decode takes, and how many of its actions are then too old to execute.
-
-        Args:
-            decode: Record of the decode.
-            observed: Control step at which the decode's observation was taken.
-
-        Raises:
-            KervError: The latency is negative or not finite.
-        """
+        """Return the delay of a decode whose observation was taken at the control step `observed`."""
         seconds = self.latency(decode)
         steps = self.expected = steps_during(seconds, self.space.control_hz)
         stale = min(steps, len(decode.actions) - 1) if self.compensation == CHUNK else 0

@@ -20,11 +20,11 @@ from kerv_cli.engine.chunk import Follower
 from kerv_cli.engine.decoder import Decoder, Stopwatch
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.episodes.cost import Profile, prices, read_profile, work_of_record
-from kerv_cli.episodes.episode import Latency, RealClock, steps_during
+from kerv_cli.episodes.episode import Latency, RealClock
 from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.episodes.interface import read_interface
 from kerv_cli.episodes.remote import RemoteDecoder, metadata_of
-from kerv_cli.episodes.settings import CHUNK, MEASURED, PROFILE, REAL, WAITS, RolloutSettings
+from kerv_cli.episodes.settings import MEASURED, PROFILE, REAL, WAITS, RolloutSettings
 from kerv_cli.methods.artifacts import Artifacts, Use
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.settings import EXPERT, MODEL, REMOTE, MethodSettings
@@ -68,7 +68,7 @@ def check(settings: RolloutSettings, is_awaited: bool = False) -> dict[str, str]
     spec.check_stress(settings.world.stress)
     if settings.policy.kind != MODEL:
         _check_undecoded(settings)
-        _check_clock(settings, spec, None)
+        clock_for(settings, spec)
     if settings.policy.kind == REMOTE:
         return _check_remote(settings, spec, is_awaited)
     if settings.policy.kind == EXPERT:
@@ -88,7 +88,9 @@ def check(settings: RolloutSettings, is_awaited: bool = False) -> dict[str, str]
         if settings.rollout.batch > 1:
             raise UsageError(f"deviation_every={settings.deviation_every}: not in batches. Leave out rollout.batch")
     method.check(target, settings.rollout.batch)
-    profile = _check_clock(settings, spec, target)
+    clock_for(settings, spec)
+    is_profiled = settings.rollout.clock == REAL and settings.rollout.latency == PROFILE
+    profile = {"profile": sha256_of(_profile_path(settings))} if is_profiled else {}
     hashes = artifacts.check(method.needs, Use(method.settings, tasks))
     # stored with every episode, so that tables show which policies read the privileged state
     observation = str(target.settings.get(OBSERVATION, "vision"))
@@ -134,49 +136,6 @@ def _check_undecoded(settings: RolloutSettings) -> None:
             raise UsageError(f"policy={kind} with {word}: {why}, leave it out")
 
 
-def _check_clock(settings: RolloutSettings, spec: EnvironmentSpec, target: TargetDescription | None) -> dict[str, str]:
-    """Refuse settings of the clock that cannot work (docs/methods.md §8).
-
-    Args:
-        settings: The rollout's settings.
-        spec: The environment.
-        target: The policy's description. None for the expert.
-
-    Returns:
-        `{"profile": HASH}` with the SHA-256 of the profile that the rollout reads. Empty if it reads no profile.
-
-    Raises:
-        UsageError: An episode would end before its first action, or all actions of a chunk are too old when they
-            arrive. Or the profile is missing, damaged, or lacks a phase that the method needs. Or the policy is the
-            expert, for which a profile has no latencies.
-    """
-    timing = settings.rollout
-    if timing.clock != REAL or timing.latency == MEASURED:
-        return {}
-    if timing.latency == PROFILE:
-        if target is None:
-            raise UsageError(
-                f"policy={settings.policy.kind} with rollout.latency=profile: it has no forwards; use "
-                "rollout.latency=constant or measured"
-            )
-        _profile_latency(settings, target)
-        return {"profile": sha256_of(_profile_path(settings))}
-    late = steps_during(timing.latency_ms / 1000.0, spec.actions.control_hz)
-    horizon = spec.control_steps(settings.world.horizon, resolve_tasks(settings.task))
-    if late >= horizon:
-        raise UsageError(
-            f"rollout.latency_ms={timing.latency_ms:g}: {late} control steps, but an episode of {spec.name} has "
-            f"{horizon}"
-        )
-    steps = 1 if target is None else settings.chunk or target.chunk
-    if timing.delay_compensation == CHUNK and late >= steps:
-        raise UsageError(
-            f"rollout.latency_ms={timing.latency_ms:g} with rollout.delay_compensation=chunk: all {steps} control "
-            f"steps of a chunk are stale after {late}"
-        )
-    return {}
-
-
 def decoder_for(settings: RolloutSettings, task: str) -> Follower:
     """Return the decoder for one setting (a method with all its options) on one task, warmed up.
 
@@ -201,31 +160,32 @@ def method_decoder(settings: RolloutSettings, task: str = "") -> Decoder:
     return decoder
 
 
-def clock_for(settings: RolloutSettings, task: str) -> RealClock | None:
+def clock_for(settings: RolloutSettings, spec: EnvironmentSpec) -> RealClock | None:
     """Return the clock of a world that goes on while the policy decodes. None if the world waits.
 
     `rollout.latency` chooses the source of a decode's latency: a constant, the measured time, or a profile. A profile
     is a file of `kerv bench` with the seconds that each phase of a decode (encode, prefill, …) takes on some machine.
-
-    Raises:
-        UsageError: The profile is missing or damaged, or it lacks a phase that the method needs.
     """
     timing = settings.rollout
     if timing.clock == WAITS:
         return None
-    if timing.latency == PROFILE:
-        latency = _profile_latency(settings, artifacts_of(settings).description)
-    else:
-        latency = attrgetter("seconds") if timing.latency == MEASURED else lambda decode: timing.latency_ms / 1000.0
-    return RealClock(latency, spec_of(task).actions, timing.delay_compensation)
+    target = artifacts_of(settings).description if settings.policy.kind == MODEL else None
+    latency: Latency | float = timing.latency_ms / 1000.0
+    if timing.latency == MEASURED:
+        latency = attrgetter("seconds")
+    elif timing.latency == PROFILE:
+        latency = _profile_latency(settings, target)
+    horizon = spec.control_steps(settings.world.horizon, resolve_tasks(settings.task))
+    chunk = 1 if target is None else settings.chunk or target.chunk
+    return RealClock(latency, spec.actions, timing.delay_compensation, horizon, chunk)
 
 
-def _profile_latency(settings: RolloutSettings, target: TargetDescription) -> Latency:
-    """Return a function that computes the latency of a decode from the rollout's profile.
-
-    Raises:
-        UsageError: The profile is missing or damaged, or it lacks a phase that the method needs.
-    """
+def _profile_latency(settings: RolloutSettings, target: TargetDescription | None) -> Latency:
+    if target is None:
+        raise UsageError(
+            f"policy={settings.policy.kind} with rollout.latency=profile: it has no forwards; use "
+            "rollout.latency=constant or measured"
+        )
     path, name = _profile_path(settings), settings.rollout.profile
     try:
         profile = read_profile(path)

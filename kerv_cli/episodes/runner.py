@@ -87,7 +87,7 @@ class Runner:
         self.settings, self.task = settings, task
         self.decoder = decoder_for(settings, task)
         self.stress = build_stress(settings.world.stress)
-        self.clock = clock_for(settings, task)
+        self.clock = clock_for(settings, spec_of(task))
         self._recording = dataclasses.replace(settings.world.camera, size=settings.record_size, supersample=1)
 
     def episode(self, seed: int, recorded: bool = False) -> EpisodeRecord:
