@@ -141,17 +141,14 @@ def test_a_command_in_a_message_runs(command, tmp_path, monkeypatch):
     check_runs(command)
 
 
-FEW = (
-    "kerv train drafter policy.target=mt10-h1 policy.artifacts.drafter=mt10-h1-few demos=mt10+visit "
-    "drafter.samples=1000 drafter.unroll=1 drafter.final_norm=false train.steps=300 train.validate_every=100 "
-    "train.stored=float16"
-)
 REMEDIES = {
     "rollout method=ar,one_pass": "kerv rollout -m method=ar,one_pass",
     "rollout policy.target=mine": "kerv train target name=mine",
-    "rollout policy.target=mt10-150m": "kerv build target grow=150m policy.target=mt10-vision name=mt10-150m",
-    "sweep study=papers_libero": "kerv build target grow=150m policy.target=libero-state name=libero-150m",
-    "rollout method=spec_vla policy.artifacts.drafter=mt10-h1-few": FEW,
+    "rollout policy.target=mt10-150m": "kerv train target name=mt10-150m",
+    "sweep study=papers_libero": "kerv sweep study=papers_libero --cfg",
+    "rollout method=spec_vla policy.artifacts.drafter=few": (
+        "kerv train drafter policy.target=mt10-vision policy.artifacts.drafter=few"
+    ),
     "rollout nonsense=3": "kerv rollout --cfg",
     "report study=nosuch": "kerv runs list",
     "report study=papers": "kerv sweep study=papers",
@@ -168,7 +165,7 @@ REMEDIES = {
 def test_a_remedy_is_for_the_folder_that_was_typed(line, remedy, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     said = refusal(*line.split(), "results=größe mit leerzeichen")
-    (named,) = re.findall(r"(['`])(kerv .*?)\1(?!\w)", said)
+    *_, named = re.findall(r"(['`])(kerv .*?)\1(?!\w)", said)
     assert shlex.split(named[1]) == [*remedy.split(), "results=größe mit leerzeichen"], said
     check_runs(named[1])
 

@@ -52,21 +52,6 @@ def conf_dir() -> Path:
     raise UsageError(f"no configuration in {' or '.join(map(str, folders))}: set KERV_CONF_DIR to a folder like conf/")
 
 
-def command_of_a_study(word: str) -> str | None:
-    """Return the first command in the study files that contains the setting `word`. None if no command does.
-
-    The list `first` of a study file holds the commands that make what the study needs, such as targets and drafters.
-
-    Args:
-        word: A setting with its value, such as `name=mt10-h1-150m` or `policy.artifacts.drafter=mt10-h1-few`.
-    """
-    for path in sorted((conf_dir() / "study").glob("*.yaml")):
-        for command in read_yaml_lines(path, f"study={path.stem}")[0].get("first", []):
-            if word in command.split():
-                return str(command)
-    return None
-
-
 def groups() -> dict[str, list[str]]:
     """Return the names that can be chosen in each group of settings: {"method": ["ar", "spec_vla", …], …}."""
     names: dict[str, set[str]] = {}

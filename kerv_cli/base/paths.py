@@ -6,7 +6,6 @@ import re
 import tempfile
 from pathlib import Path
 
-from kerv_cli.base.config import command_of_a_study
 from kerv_cli.base.errors import StorageError, UsageError
 from kerv_cli.base.files import storage_errors, visible
 
@@ -138,8 +137,8 @@ def find_target(results: str, name: str) -> Path:
             f"target '{name}' is unfinished: 'kerv runs show target/{name}' shows the command that goes on with its "
             "training"
         )
-    making = command_of_a_study(f"name={name}") or f"kerv train target name={name}"
-    remedies = ["name a folder that holds target.json" if "/" in name else f"make it with '{making}'"]
+    making = f"make it with 'kerv train target name={name}'"
+    remedies = ["name a folder that holds target.json" if "/" in name else making]
     names = target_names(results)
     remedies += [f"take one of {', '.join(names)}"] if names else []
     raise UsageError(f"no target '{name}' in {', '.join(map(str, folders))}: {', or '.join(remedies)}")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import shlex
+from collections.abc import Iterator
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -9,7 +12,7 @@ import typer
 
 from kerv_cli.base.config import compose, expand, groups, split
 from kerv_cli.base.durations import count
-from kerv_cli.base.errors import UsageError
+from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.cli.command import Cfg, command
 from kerv_cli.cli.common import AsJson, ShowPlan, end_with_json, print_rows, progress_bar
 from kerv_cli.cli.studies import (
@@ -25,6 +28,7 @@ from kerv_cli.cli.studies import (
 from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 
 if TYPE_CHECKING:
+    from kerv_cli.episodes.resolve import ResolvedStudy
     from kerv_cli.lab.follow import Outcome
     from kerv_cli.lab.store import Study
     from kerv_cli.report.tables import StudyData
@@ -66,7 +70,9 @@ def sweep(overrides: list[str], cfg: Cfg = False, show_plan: ShowPlan = False, a
     from kerv_cli.lab.workers import workers
     from kerv_cli.report.viewing import save_recording
 
-    planned = plan(resolved, check(resolved), opened(resolved.first.results), ["sweep", *overrides])
+    with _first_commands(resolved, overrides):
+        settings = check(resolved)
+    planned = plan(resolved, settings, opened(resolved.first.results), ["sweep", *overrides])
     check_installed(planned, resolved)
     study, guess = planned.study, resolved.study.seconds
     if show_plan:
@@ -81,6 +87,18 @@ def sweep(overrides: list[str], cfg: Cfg = False, show_plan: ShowPlan = False, a
     print_outcome(study, outcome, data, as_json)
     write(study, outcome, data, resolved.sweep.loss)
     raise typer.Exit(int(bool(outcome.failed)))
+
+
+@contextlib.contextmanager
+def _first_commands(resolved: ResolvedStudy, overrides: list[str]) -> Iterator[None]:
+    """Add to an error that the study's file lists commands to run before it, if it does."""
+    try:
+        yield
+    except KervError as error:
+        if resolved.study.first:
+            typed = shlex.join(["sweep", *(word for word in overrides if word.startswith("study="))])
+            error.args = (f"{error}; 'kerv {typed} --cfg' lists under first: what to run before",)
+        raise
 
 
 def _list_studies(as_json: bool) -> None:

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from kerv_cli.base.config import command_of_a_study
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.manifests import check_files, read_file
@@ -218,8 +217,7 @@ class Artifacts:
         target, name = f"policy.target={self.policy.target}", self.policy.artifacts.get(files.kind)
         if name is None or "/" in name:
             return f"kerv prepare {target}"
-        word = f"policy.artifacts.{files.kind}={name}"
-        return command_of_a_study(word) or " ".join(("kerv", *files.command, target, word))
+        return " ".join(("kerv", *files.command, target, f"policy.artifacts.{files.kind}={name}"))
 
     def load(self, kind: str) -> Any:
         """Load the policy's artifact of this kind. Further calls in this process return the same object."""
