@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from examples.insertion import SPEC as INSERTION
 
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.manifests import read_file
@@ -44,6 +45,12 @@ def recorded(tmp_path_factory):
 @pytest.fixture
 def copied(recorded, tmp_path):
     return shutil.copytree(recorded, tmp_path / "demos")
+
+
+def test_a_horizon_above_the_tasks_own_is_honoured(tmp_path, monkeypatch):
+    monkeypatch.setitem(INSERTION.tasks, "insert-peg", replace(INSERTION.tasks["insert-peg"], horizon=4))
+    manifest = record(DemoConfig(("insert-peg",), 1, perturbed=0.0, horizon=120, workers=1, frame_stride=50), tmp_path)
+    assert manifest.tasks["insert-peg"].episodes[0].steps > 4
 
 
 def files_of(folder):

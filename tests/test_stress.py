@@ -176,8 +176,9 @@ def test_a_stress_of_level_0_is_no_stress():
     assert [stress_of(plain)["kind"] for plain in (zero, two)] == ["none", "light"]
 
 
-def test_what_an_environment_cannot_do_and_unknown_kinds_are_refused():
+def test_what_an_environment_cannot_do_and_unknown_kinds_are_refused(monkeypatch):
     from examples.point_mass import SPEC as POINT
+    from examples.point_mass import PointWorld
 
     renamed = tuple(dataclasses.replace(group, name=f"my {group.name}") for group in INSERTION.actions.groups)
     recorded = register_recorded("tape", INSERTION.actions, INSERTION.observation, {"wipe": "wipe the table"}, "front")
@@ -189,6 +190,14 @@ def test_what_an_environment_cannot_do_and_unknown_kinds_are_refused():
     ):
         with pytest.raises(UsageError, match=why):
             spec.check_stress(StressSettings(kind, 1))
+    monkeypatch.setattr(PointWorld, "stressable", frozenset({"actions"}))
+    with pytest.raises(UsageError, match="not possible in point-mass: its world draws no images"):
+        POINT.check_stress(StressSettings("sensor", 1))
+    monkeypatch.undo()
+    monkeypatch.setattr(Sensor, "levels", ((1.0, 0.0, 1.0),) * 2)
+    with pytest.raises(UsageError, match="level=3: sensor has the levels 0 to 2"):
+        POINT.check_stress(StressSettings("sensor", 3))
+    monkeypatch.undo()
     for kind in ("push", "sensor"):
         POINT.check_stress(StressSettings(kind, 1))
     for kind in KINDS:

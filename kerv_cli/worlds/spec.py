@@ -21,7 +21,7 @@ from kerv_cli.base.registry import load
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
 from kerv_cli.worlds import Task
 from kerv_cli.worlds.settings import CameraSettings, StressSettings
-from kerv_cli.worlds.stress import NO_STRESS, Stress, StressPart
+from kerv_cli.worlds.stress import NO_STRESS, Stress, StressPart, build
 from kerv_cli.worlds.views import views_of
 
 # scripted controller of one task: from an observation to an action (D,) within the limits, without memory
@@ -31,6 +31,8 @@ Expert: TypeAlias = Callable[[Observation], NDArray[np.float64]]
 _LACKS = {
     "position": "its actions have no group 'position'",
     "model": "its world has no MuJoCo model",
+    "images": "its world draws no images",
+    "actions": "its world takes no changed actions",
 }
 
 
@@ -164,9 +166,10 @@ class EnvironmentSpec:
         return horizon or found[0]
 
     def check_stress(self, settings: StressSettings) -> None:
-        """Raise UsageError if the environment lacks something that a kind of stress needs."""
+        """Raise UsageError if there is no such level, or the environment lacks something that the stress needs."""
         if not settings.active:
             return
+        build(settings)
         offered = load(self.world_class).stressable if self.world_class else frozenset()
         offered |= {"position"} & {group.name for group in self.actions.groups}
         for need in StressPart.find(settings.kind).requires:

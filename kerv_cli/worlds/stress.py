@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.registry import Part
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.worlds.settings import StressSettings
@@ -65,6 +66,8 @@ class Stress:
     levels: ClassVar[tuple[Any, ...]] = ()
 
     def __init__(self, level: int = 0) -> None:
+        if level > len(self.levels):
+            raise UsageError(f"world.stress.level={level}: {self.kind} has the levels 0 to {len(self.levels)}")
         self.level = level
         self.amount: Any = self.levels[level - 1] if level else None
 

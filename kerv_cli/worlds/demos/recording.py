@@ -261,7 +261,9 @@ def _record_seeds(
     config: DemoConfig, out: Path, task: str, seeds: Sequence[int], make_actor: MakeActor | None
 ) -> tuple[str, _Outcomes]:
     actor, outcomes = make_actor(config) if make_actor else None, _Outcomes()
-    with config.spec.open_world(task, config.camera) as world:
+    # the world also runs the tail, so a short horizon leaves it the task's own
+    horizon = max(config.horizon, config.spec.control_steps(0, [task]))
+    with config.spec.open_world(task, config.camera, horizon) as world:
         for seed in seeds:
             path, failure = episode_path(out, world.task, seed), out / "failed" / world.task / f"{seed:06d}.json"
             outcomes[seed] = None
