@@ -230,20 +230,14 @@ def test_strict_decoding_equals_ar(target, monkeypatch, seed, nodes, inside, fix
 # --- formats of the weights
 
 
-def test_bfloat16_and_int8_decode_nearly_the_same(checkpoint, tmp_path, target):
+def test_bfloat16_decodes_nearly_the_same(checkpoint, tmp_path, target):
     half = loaded(imported(checkpoint, tmp_path), torch.bfloat16)
-    small = loaded(imported(checkpoint, tmp_path, int8=True, name="int8"))
-    layer = small.model.language_model.model.layers[0].mlp.up_proj
-    assert layer.weight.dtype == torch.int8
     prompt = target.encode(shown(1))
     with torch.inference_mode():
         positions = torch.arange(prompt.shape[1])
         right = target.head(target.forward(prompt, positions)[0, -1])
-        for other, least in ((half, 0.99), (small, 0.99)):
-            got = other.head(other.forward(other.encode(shown(1)), positions)[0, -1]).float()
-            assert float(torch.corrcoef(torch.stack([right, got]))[0, 1]) > least
-    hashes = {load_target(tmp_path / "artifacts/target" / name)[1].sha256 for name in ("int8", "openvla")}
-    assert len(hashes) == 2
+        got = half.head(half.forward(half.encode(shown(1)), positions)[0, -1]).float()
+    assert float(torch.corrcoef(torch.stack([right, got]))[0, 1]) > 0.99
 
 
 # --- bad input: one line
@@ -315,6 +309,10 @@ def pickled(folder: Path) -> None:
     torch.save({"x": torch.zeros(1)}, folder / "pytorch_model.bin")
 
 
+def doubled(folder: Path) -> None:
+    shutil.copy(folder / "model-00001-of-00002.safetensors", folder / "other.safetensors")
+
+
 @pytest.mark.parametrize(
     ("harm", "said"),
     [
@@ -323,6 +321,7 @@ def pickled(folder: Path) -> None:
         (rewritten(lambda tensors: tensors[NORM].fill_(math.nan)), f"numbers in {NORM} that are not finite"),
         (pickled, "holds pickled weights (pytorch_model.bin)"),
         (lambda folder: (folder / "tokenizer.json").unlink(), "no tokenizer.json in"),
+        (doubled, "model-00001-of-00002.safetensors and other.safetensors in "),
     ],
 )
 def test_damaged_files_are_refused_in_one_line(checkpoint, tmp_path, harm, said):

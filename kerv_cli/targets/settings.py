@@ -70,10 +70,8 @@ class BuildTargetSettings(RunSettings):
     )
     control_hz: float = number(5.0, above=0, most=10_000, help="control steps per second, if environment= is null")
     camera: str = setting("", "camera whose image it reads; empty: the environment's first, else primary")
-    prompt: str = choice("openvla", "openvla", "openvla_v01", help="text around the instruction")
     crop: bool = setting(False, "crop to the central 90 %, for checkpoints trained on augmented images (LIBERO's)")
     libero: bool = setting(
         False, "first compress the image as JPEG and resize it by Lanczos, as OpenVLA's evaluation on LIBERO does"
     )
-    int8: bool = setting(False, "store the language model's layers with one byte per weight")
     prompt_tokens: int = number(64, 1, 65_536, help="longest prompt in tokens, without the vision tokens")

@@ -117,21 +117,13 @@ def pixels_of(
 
 TOKENIZER = "tokenizer.json"
 BEGIN, BOUNDARY = "<s>", "\u2581"
-# the instruction replaces `{}`; v0.1 checkpoints need `openvla_v01`
-PROMPTS = {
-    "openvla": "In: What action should the robot take to {}?\nOut:",
-    "openvla_v01": (
-        "A chat between a curious user and an artificial intelligence assistant. The assistant gives helpful, "
-        "detailed, and polite answers to the user's questions. USER: What action should the robot take to {}? "
-        "ASSISTANT:"
-    ),
-}
+PROMPT = "In: What action should the robot take to {}?\nOut:"  # the instruction replaces `{}`
 
 
 class Prompter:
-    """Turns instructions into the token ids of a checkpoint's prompt, at most `limit`. `form` is a key of `PROMPTS`."""
+    """Turns instructions into the token ids of a checkpoint's prompt, at most `limit`."""
 
-    def __init__(self, folder: Path, shape: Shape, form: str, limit: int) -> None:
+    def __init__(self, folder: Path, shape: Shape, limit: int) -> None:
         path = folder / TOKENIZER
         if not path.is_file():
             raise CheckpointError(f"no {TOKENIZER} in {folder}: copy the one that was published with the checkpoint")
@@ -143,8 +135,7 @@ class Prompter:
             self.tokenizer = Tokenizer.from_file(str(path))
         except Exception as error:
             raise CheckpointError(f"{path} cannot be read ({str(error)[:120]}): copy it again") from error
-        self.text, self.limit = PROMPTS[form], limit
-        size = self.tokenizer.get_vocab_size(with_added_tokens=False)
+        self.limit, size = limit, self.tokenizer.get_vocab_size(with_added_tokens=False)
         self.begin, self.boundary = map(self.tokenizer.token_to_id, (BEGIN, BOUNDARY))
         if size != shape.vocabulary or None in (self.begin, self.boundary):
             raise CheckpointError(
@@ -152,7 +143,7 @@ class Prompter:
             )
 
     def ids(self, instruction: str) -> list[int]:
-        ids: list[Any] = self.tokenizer.encode(self.text.format(instruction.lower())).ids
+        ids: list[Any] = self.tokenizer.encode(PROMPT.format(instruction.lower())).ids
         if ids[:1] != [self.begin]:
             ids = [self.begin, *ids]
         if ids[-1] != self.boundary:

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import regular, sha256_of, visible
 from kerv_cli.targets.openvla.config import CONFIG, Shape
-from kerv_cli.targets.openvla.network import OpenVLAModel, quantise
+from kerv_cli.targets.openvla.network import OpenVLAModel
 
 Sizes = tuple[int, ...]
 PICKLED = (".bin", ".pt", ".pth", ".ckpt")
@@ -83,6 +83,11 @@ def open_shards(folder: Path) -> Shards:
     for file in files:
         with _open_tensors(file) as handle:
             for name in handle.keys():  # noqa: SIM118 - not a mapping
+                if name in tensors:
+                    raise CheckpointError(
+                        f"{tensors[name]} and {file.name} in {folder} both hold {name}: remove the one that does not "
+                        "belong there"
+                    )
                 tensors[name], shapes[name] = file.name, tuple(handle.get_slice(name).get_shape())
     return Shards(folder, tensors, shapes)
 
@@ -121,17 +126,13 @@ def open_checked(folder: Path, shape: Shape) -> Shards:
     return shards
 
 
-def load_model(folder: Path, shape: Shape, device: str, dtype: torch.dtype, int8: bool) -> OpenVLAModel:
-    """Load and freeze the model of a checkpoint. With `int8`, the language model's layers take one byte per weight."""
+def load_model(folder: Path, shape: Shape, device: str, dtype: torch.dtype) -> OpenVLAModel:
     shards = open_checked(folder, shape)
     with torch.device("meta"):
         model = OpenVLAModel(shape)
     names = model.state_dict().keys()
     state = {n: t.to(device=device, dtype=dtype) for n, t in shards.items() if n in names}
     model.load_state_dict(state, assign=True)
-    del state
-    if int8:
-        quantise(model.language_model.model.layers)
     return model.eval().requires_grad_(False)
 
 

@@ -219,34 +219,3 @@ class OpenVLAModel(nn.Module):
         self.vision_backbone = VisionBackbone(shape)
         self.projector = projector(shape)
         self.language_model = LanguageModel(shape.language)
-
-
-class Int8Linear(nn.Module):
-    """A linear layer whose weights are int8 with a scale per output. It takes half the memory of bfloat16.
-
-    The matrix multiplication is computed in the number format of the input.
-
-    Attributes:
-        weight: (outputs, inputs) int8.
-        scale: (outputs,) factors of the weights.
-    """
-
-    weight: Tensor
-    scale: Tensor
-
-    def __init__(self, weight: Tensor, dtype: torch.dtype) -> None:
-        super().__init__()
-        scale = weight.float().abs().amax(1).clamp_min(1e-12) / 127
-        self.register_buffer("weight", (weight.float() / scale[:, None]).round().to(torch.int8))
-        self.register_buffer("scale", scale.to(dtype))
-
-    def forward(self, x: Tensor) -> Tensor:
-        return F.linear(x, self.weight.to(x.dtype)) * self.scale
-
-
-def quantise(module: nn.Module) -> None:
-    for name, child in module.named_children():
-        if isinstance(child, nn.Linear):
-            setattr(module, name, Int8Linear(child.weight.data, child.weight.dtype))
-        else:
-            quantise(child)

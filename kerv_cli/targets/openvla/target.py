@@ -44,10 +44,8 @@ class OpenVLASettings:
         checkpoint: Folder of the published files.
         statistics: Name of the data set whose action statistics are used.
         files: Size of each file of weights in bytes, by name.
-        prompt: Version of the prompt, `openvla` or `openvla_v01`.
         crop: Whether images are cropped to the central 90 %, for checkpoints fine-tuned on augmented images.
         libero: Whether images are first compressed as JPEG and resized by Lanczos, as OpenVLA does it for LIBERO.
-        int8: Whether the language model's layers have one byte per weight.
         prompt_tokens: Longest prompt in tokens, without the vision patches.
         image_size: Pixels per side of a tower's image.
     """
@@ -55,10 +53,8 @@ class OpenVLASettings:
     checkpoint: str
     statistics: str
     files: dict[str, int]
-    prompt: str = "openvla"
     crop: bool = False
     libero: bool = False
-    int8: bool = False
     prompt_tokens: int = 64
     image_size: int = 224
     chunk: int = 1
@@ -74,9 +70,9 @@ class OpenVLATarget:
         self.settings, self.actions, self.cameras = settings, description.actions, tuple(description.cameras)
         self.observation = description.observation
         self.shape = shape = read_shape(source)
-        self.prompter = Prompter(source, shape, settings.prompt, settings.prompt_tokens)
+        self.prompter = Prompter(source, shape, settings.prompt_tokens)
         self.normalisations = read_normalisations(source)
-        self.model = model = load_model(source, shape, device, dtype, settings.int8)
+        self.model = model = load_model(source, shape, device, dtype)
         self.chunk, self.width = settings.chunk, shape.language.hidden_size
         self.heads, self.feed_forward = shape.language.num_attention_heads, shape.language.intermediate_size
         self.max_prompt, self.pooled_width = shape.patches + settings.prompt_tokens, 2 * self.width
@@ -156,11 +152,11 @@ def import_checkpoint(settings: BuildTargetSettings, folder: Path) -> dict[str, 
     spec = None if settings.environment is None else EnvironmentPart.find(settings.environment).built()
     statistics, bounds = read_statistics(source, settings.statistics)
     actions = action_space(shape, bounds, spec.actions if spec else None, settings.control_hz)
-    prompt = Prompter(source, shape, settings.prompt, settings.prompt_tokens).ids("move")
+    prompt = Prompter(source, shape, settings.prompt_tokens).ids("move")
     read_normalisations(source)
     shards = open_checked(source, shape)
     parameters, hashes = check_finite(shards), shards.hashes()
-    chosen = {name: getattr(settings, name) for name in ("prompt", "crop", "int8", "libero")}
+    chosen = {name: getattr(settings, name) for name in ("crop", "libero")}
     target = OpenVLASettings(str(source), statistics, shards.sizes(), **chosen)
     target = replace(target, prompt_tokens=settings.prompt_tokens, image_size=shape.towers[0].image)
     if not settings.libero:  # left out, so that targets from before this setting keep their hashes
