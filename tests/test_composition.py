@@ -75,7 +75,7 @@ def test_a_preset_is_the_parts_that_its_name_promises(method):
     assert asked.method == method
     if method in PRESETS:
         assert asked.parts() == {**AR, **PRESETS[method]}
-    assert (asked.chunk, asked.datastore) == (0, NoSettings("exact"))
+    assert asked.chunk == 0
     Method.of(asked).check(SimpleNamespace(chunk=4, actions=SPEC.actions, parallel=method == "parallel"))
 
 
@@ -200,7 +200,6 @@ def test_a_method_needs_what_its_parts_read_and_nothing_else(overrides, wanted):
         ("method=spec_vla acceptance=sequence threshold.r=5", "threshold.r=5"),
         ("method=spec_vla policy.artifacts.datastore=mine", "policy.artifacts.datastore=mine"),
         ("method=spec_vla policy.artifacts.drafter=mine", ""),
-        ("method=spec_vla datastore=exact", "datastore=exact"),
         ("method=early_unverified rectifier=compensate", "rectifier=compensate"),
         ("method=one_pass_streak prefill_draft=early skip=always rectifier=compensate", "rectifier=compensate"),
         ("method=one_pass_streak prefill_draft=hold skip=always rectifier=compensate", ""),

@@ -16,7 +16,7 @@ from kerv_cli.base.config import _composed, compose, conf_dir, expand, groups, s
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import check_label, check_settings, description
 from kerv_cli.base.paths import artifact, find_target
-from kerv_cli.base.registry import PART_GROUPS, SETTINGS_GROUPS, NoSettings, part_of, parts
+from kerv_cli.base.registry import METHOD_KINDS, SETTINGS_GROUPS, NoSettings, part_of, parts
 from kerv_cli.cli.common import settings_yaml
 from kerv_cli.episodes.interface import read_interface
 from kerv_cli.episodes.resolve import resolve
@@ -56,8 +56,8 @@ def test_every_setting_has_a_description():
     assert undescribed == []
 
 
-WHOLE = {group: names for group, names in groups().items() if group not in (*PART_GROUPS, "interface")}
-PARTS = {group: groups()[group] for group in PART_GROUPS}
+WHOLE = {group: names for group, names in groups().items() if group not in (*METHOD_KINDS, "interface")}
+PARTS = {group: groups()[group] for group in METHOD_KINDS}
 
 
 @pytest.mark.parametrize("choice", list(chain(*([(g, n) for n in names] for g, names in WHOLE.items()))))

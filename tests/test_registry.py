@@ -98,7 +98,7 @@ def test_what_a_part_names_is_there(kind, name):
     part = find(kind, name)
     assert (part.kind, part.name) == (kind, name)
     assert part.absent or callable(part.code)
-    if kind in (*METHOD_KINDS, "datastore"):
+    if kind in METHOD_KINDS:
         chosen = part.settings(kind=name)
         assert chosen.kind == name
         assert isinstance(part.needed(chosen), tuple)

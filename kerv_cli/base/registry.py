@@ -42,12 +42,9 @@ METHODS = ("kerv_cli.methods",)
 METHOD_KINDS = ("prefill_draft", "proposer", "acceptance", "threshold", "rectifier", "boundary", "skip")
 """The kinds of parts that make up a method, in the order in which a decode uses them."""
 
-PART_GROUPS = (*METHOD_KINDS, "datastore")
-"""Groups of a rollout's settings that choose a part, as in `proposer=drafter`. YAML files in conf/<group>/ are further
-choices."""
-
-SETTINGS_GROUPS = (*PART_GROUPS, "drafter")
-"""PART_GROUPS, and the group `drafter`, which chooses the drafter that `kerv train drafter` trains."""
+SETTINGS_GROUPS = (*METHOD_KINDS, "drafter")
+"""Groups of settings that choose a part, as in `proposer=drafter`. YAML files in conf/<group>/ are further choices.
+`drafter` chooses what `kerv train drafter` trains."""
 
 DRAFTING = "draft"
 """Kind of cost (docs/measuring.md) of a proposer whose drafter is one decoder layer of the target's shape."""
@@ -307,12 +304,6 @@ class SkipPart(Part):
     merges: bool = False
     verifies: bool = True
     batchable: bool = False
-
-
-class SearchPart(Part):
-    """A search through a datastore. The decorated class is an `Index` (`kerv_cli/methods/heisd/__init__.py`)."""
-
-    kind = "datastore"
 
 
 @dataclass(frozen=True, kw_only=True)

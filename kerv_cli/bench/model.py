@@ -115,9 +115,7 @@ def open_model(settings: BenchSettings) -> Model:
     except UsageError as error:
         raise UnknownName("target", settings.target, [*target_names(settings.results), *shapes]) from error
     device, _ = set_up(settings.runtime)
-    artifacts = Artifacts(
-        settings.results, PolicySettings(target=settings.target), None, device, settings.runtime.dtype
-    )
+    artifacts = Artifacts(settings.results, PolicySettings(target=settings.target), device, settings.runtime.dtype)
     target: Any = artifacts.target
     if not hasattr(target, "layers"):
         family = artifacts.description.family

@@ -43,7 +43,7 @@ def artifacts_of(settings: MethodSettings) -> Artifacts:
     All settings in this process share the loaded objects.
     """
     device, _ = set_up(settings.runtime)
-    return Artifacts(settings.results, settings.policy, settings.datastore, device, settings.runtime.dtype)
+    return Artifacts(settings.results, settings.policy, device, settings.runtime.dtype)
 
 
 def check(settings: RolloutSettings, is_awaited: bool = False) -> dict[str, str]:

@@ -15,7 +15,7 @@ from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.files import read_yaml_lines
 from kerv_cli.base.limits import check_label
 from kerv_cli.base.paths import find_target
-from kerv_cli.base.registry import METHOD_KINDS, PART_GROUPS, AcceptancePart, ArtifactPart
+from kerv_cli.base.registry import METHOD_KINDS, AcceptancePart, ArtifactPart
 from kerv_cli.episodes.identity import NOT_DETERMINING, NOT_DETERMINING_RUNTIME, Setting, flat, work_of
 from kerv_cli.episodes.settings import (
     CONSTANT,
@@ -362,8 +362,6 @@ def idle_keys(settings: RolloutSettings) -> dict[str, str]:
         idle |= flat({kind: part.idle(method.settings[kind])})
     for kind in ArtifactPart.every().keys() - needed:
         idle[f"policy.artifacts.{kind}"] = f"method {settings.method} reads no {kind}"
-    for group in set(PART_GROUPS[len(METHOD_KINDS) :]) - needed:
-        idle[group] = f"method {settings.method} reads no {group}"
     if timing.clock == WAITS:
         names = "latency", "latency_ms", "profile", "ar_ms", "delay_compensation"
         idle |= dict.fromkeys(map("rollout.{}".format, names), "rollout.clock=waits: the world waits for every decode")

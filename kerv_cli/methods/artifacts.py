@@ -148,15 +148,10 @@ class Artifact(Generic[T]):
 
 
 class Artifacts:
-    """The target and the artifacts of one policy, checked and loaded on demand.
+    """The target and the artifacts of one policy, checked and loaded on demand."""
 
-    `search` are the settings of the search in a datastore. If None, the search is exact.
-    """
-
-    def __init__(
-        self, results: str, policy: PolicySettings, search: Any = None, device: str = "cpu", dtype: str = "float32"
-    ) -> None:
-        self.results, self.policy, self.search, self.device, self.dtype = results, policy, search, device, dtype
+    def __init__(self, results: str, policy: PolicySettings, device: str = "cpu", dtype: str = "float32") -> None:
+        self.results, self.policy, self.device, self.dtype = results, policy, device, dtype
         for kind, name in policy.artifacts.items():
             if name is not None:  # stored settings may list kinds of a plugin that is missing now
                 ArtifactPart.find(kind, "policy.artifacts")
@@ -222,7 +217,7 @@ class Artifacts:
     def load(self, kind: str) -> Any:
         """Load the policy's artifact of this kind. Further calls in this process return the same object."""
         path, digest = self.path(kind), self.check([kind])[kind]
-        key = kind, path, digest, self.folder, self.device, self.dtype, repr(self.search)
+        key = kind, path, digest, self.folder, self.device, self.dtype
         if key not in _LOADED:
             _LOADED[key] = kind_of(kind).load(path, self)
         return _LOADED[key]

@@ -59,7 +59,6 @@ class MethodSettings(RunSettings):
     boundary: Any = part("boundary", "always", "proposer=hybrid: when retrieval drafts and when the drafter")
     skip: Any = part("skip", help="which drafts are executed without verification")
     chunk: int = number(0, 0, 1024, help="control steps per chunk; 0: as many as the target was trained for")
-    datastore: Any = part("datastore", "exact", "how stored chunks are searched: exact, or a search of a plugin")
 
     def parts(self) -> dict[str, Any]:
         return {kind: getattr(self, kind) for kind in METHOD_KINDS}

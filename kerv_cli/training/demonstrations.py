@@ -214,7 +214,7 @@ class PolicyActs:
 
 def _artifacts(settings: DemosSettings) -> Artifacts:
     runtime = settings.runtime
-    return Artifacts(settings.results, settings.policy, settings.datastore, device_of(runtime), runtime.dtype)
+    return Artifacts(settings.results, settings.policy, device_of(runtime), runtime.dtype)
 
 
 def _hash(settings: DemosSettings) -> str:

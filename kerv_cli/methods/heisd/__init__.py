@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 import zlib
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -30,7 +28,6 @@ if TYPE_CHECKING:
 
 MANIFEST = "manifest.json"
 LEAST = 3  # minimum number of positions for a curvature
-ROUNDING = 1e-5  # largest rounding error of a float32 dot product of two unit vectors
 
 
 # --- the datastore and its proposer (§4.1, §4.2)
@@ -41,41 +38,6 @@ def artifact() -> type:
     from kerv_cli.methods.heisd.datastore import DatastoreArtifact
 
     return DatastoreArtifact
-
-
-class Index(ABC):
-    """A search for the stored entries whose keys are most similar to a given key.
-
-    A search returns row numbers of the datastore. The datastore then ranks these rows exactly.
-    """
-
-    def __init__(self, store: Datastore, settings: Any) -> None:
-        self.store = store
-
-    @abstractmethod
-    def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        """Return row numbers in ascending order: those of the task's k most similar entries, and possibly more.
-
-        Args:
-            key: (d,) float32, the key to compare with.
-            without: Seed of an episode to leave out. If None, use all episodes.
-        """
-
-
-@registry.SearchPart("exact")
-class ExactIndex(Index):
-    """datastore=exact, the default: compare the key with all entries of the task, in this process."""
-
-    def candidates(self, key: np.ndarray, task: str, k: int, without: int | None) -> np.ndarray:
-        import numpy as np
-
-        shard = self.store.shards[task]
-        scores = self.store.vectors[shard] @ key
-        if without is not None:
-            scores[self.store.seeds[shard] == without] = -np.inf
-        least = np.partition(scores, -k)[-k] if k <= len(scores) else -np.inf
-        slack = ROUNDING * self.store.longest * math.sqrt(key @ key)
-        return np.flatnonzero((scores >= least - slack) & (scores > -np.inf)) + shard.start
 
 
 @dataclass

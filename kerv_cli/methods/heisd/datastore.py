@@ -28,18 +28,18 @@ from torch import Tensor
 
 from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.manifests import content_of
-from kerv_cli.base.registry import SearchPart
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.decisions import ROOT
 from kerv_cli.engine.draft import Draft, read
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.methods.artifacts import Artifact, Artifacts
-from kerv_cli.methods.heisd import MANIFEST, Index
+from kerv_cli.methods.heisd import MANIFEST
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.worlds import spec_of
 
 VECTORS, PAYLOAD, PROJECTION = "vectors.npy", "payload.parquet", "projection.npy"
 CROSS = 0.1  # assumed probability that a path of retrieved groups changes to another neighbour after a group
+ROUNDING = 1e-5  # largest rounding error of a float32 dot product of two unit vectors
 COLUMNS = {"seeds": "seed", "steps": "step", "left": "left"}
 
 
@@ -162,21 +162,14 @@ class Datastore:
     left: np.ndarray  # (rows,) int64, control steps to the episode's end
     shards: dict[str, slice]  # full name of the task -> its rows
     projection: np.ndarray | None = None  # (numbers before projection, d); None: keys are not projected
-    search: Any = None  # settings of the search; None: exact; every search finds the same neighbours
-
-    @functools.cached_property
-    def index(self) -> Index:
-        kind = self.search.kind if self.search else "exact"
-        index: Index = SearchPart.find(kind, "datastore.kind").built(self, self.search)
-        return index
 
     @functools.cached_property
     def longest(self) -> float:
         return float(np.linalg.norm(self.vectors, axis=1).max(initial=0.0))
 
     @classmethod
-    def open(cls, folder: Path, description: TargetDescription, search: Any = None) -> Datastore:
-        """Open a datastore, and check that it was built for a target. If `search` is None, the search is exact."""
+    def open(cls, folder: Path, description: TargetDescription) -> Datastore:
+        """Open a datastore, and check that it was built for a target."""
         manifest = DatastoreArtifact().checked(folder, description)
         rows, size = manifest.rows, manifest.actions.longest(manifest.chunk)
         try:
@@ -190,9 +183,7 @@ class Datastore:
         except (OSError, KeyError, TypeError, ValueError, MemoryError) as error:  # pyarrow's errors are ValueErrors
             raise CheckpointError(f"the datastore in {folder} is damaged ({error}): build it again") from error
         shards = {task: slice(*shard.rows) for task, shard in manifest.tasks.items()}
-        store = cls(manifest, vectors, **payload, shards=shards, projection=projection, search=search)
-        _ = store.index  # open the search now, so that a search that cannot work is refused at once
-        return store
+        return cls(manifest, vectors, **payload, shards=shards, projection=projection)
 
     @property
     def tasks(self) -> Collection[str]:
@@ -213,9 +204,18 @@ class Datastore:
         if task not in self.shards:
             raise UnknownName("task of the datastore", task, self.shards)
         key = np.asarray(key, dtype=np.float32)
-        rows, similarity = best(self.vectors, self.index.candidates(key, task, k, without), key, k)
+        rows, similarity = best(self.vectors, self.candidates(key, self.shards[task], k, without), key, k)
         chunks = self.tokens[rows].astype(np.int64)
         return Neighbours(similarity, chunks, self.seeds[rows], self.steps[rows], self.left[rows])
+
+    def candidates(self, key: np.ndarray, shard: slice, k: int, without: int | None) -> np.ndarray:
+        """Return, in ascending order, the rows of the k most similar entries and of all that rounding may hide."""
+        scores = self.vectors[shard] @ key
+        if without is not None:
+            scores[self.seeds[shard] == without] = -np.inf
+        least = np.partition(scores, -k)[-k] if k <= len(scores) else -np.inf
+        slack = ROUNDING * self.longest * math.sqrt(key @ key)
+        return np.flatnonzero((scores >= least - slack) & (scores > -np.inf)) + shard.start
 
 
 def _read_payload(path: Path) -> dict[str, np.ndarray]:
@@ -248,7 +248,7 @@ class DatastoreArtifact(Artifact[Manifest]):
         return description.content
 
     def load(self, path: Path, artifacts: Artifacts) -> Datastore:
-        return Datastore.open(path, artifacts.description, artifacts.search)
+        return Datastore.open(path, artifacts.description)
 
 
 # --- the draft tree (§4.2)

@@ -79,7 +79,8 @@ def open_shards(folder: Path) -> Shards:
                 "safetensors: convert them to safetensors where you trust them"
             )
         raise CheckpointError(f"no safetensors in {folder}: name the folder of a Hugging Face checkpoint")
-    tensors, shapes = {}, {}
+    tensors: dict[str, str] = {}
+    shapes: dict[str, Sizes] = {}
     for file in files:
         with _open_tensors(file) as handle:
             for name in handle.keys():  # noqa: SIM118 - not a mapping
