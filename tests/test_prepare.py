@@ -114,6 +114,22 @@ def test_prepare_makes_what_is_missing_and_skips_what_is_there(results):
     assert "of other artifacts" in told("prepare", MINE, "replace=true", "--plan")
 
 
+@pytest.mark.parametrize(
+    ("kind", "method"),
+    {"early": "one_pass", "datastore": "retrieval_unverified", "calibration": "kerv", "drafter": "spec_vla"}.items(),
+)
+def test_the_remedy_for_a_missing_artifact_makes_it(results, kind, method):
+    shutil.rmtree(results / f"artifacts/{kind}/mine", ignore_errors=True)
+    rollout = ("rollout", f"method={method}", MINE)
+    for named in ((), (f"policy.artifacts.{kind}=other",)):
+        said = told(*rollout, *named, code=1)
+        assert f"artifacts/{kind}/" in said
+        remedy = re.findall(r"'kerv (.*?)'", said)[0]
+        plan = told(*remedy.split(), "--plan")
+        assert "other" in remedy if named else re.search(rf"{kind} +│ missing", plan)
+    assert f"leave policy.artifacts.{kind}= out" in told(*rollout, f"policy.artifacts.{kind}=./none", code=1)
+
+
 @pytest.mark.usefixtures("quick_training")
 def test_a_plan_takes_its_time_from_the_most_similar_command_on_this_machine(results):
     train = ("train", "target", "demos=few", "target=nano", "target.observation=state")

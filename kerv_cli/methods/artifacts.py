@@ -188,9 +188,7 @@ class Artifacts:
         for kind in dict.fromkeys(kinds):
             files, path = kind_of(kind), self.path(kind)
             if files.command and not self.exists(kind):
-                raise CheckpointError(
-                    f"no {files.noun} in {path}: run '{self._making(files)}', or name a folder that holds one"
-                )
+                raise CheckpointError(f"no {files.noun} in {path}: {self._making(files)}")
             description = files.checked(path, self.description)
             hashes[kind] = files.digest(path, description)
             what = f"the {files.noun} in {path} was {files.made}"
@@ -210,9 +208,11 @@ class Artifacts:
 
     def _making(self, files: Artifact[Any]) -> str:
         target, name = f"policy.target={self.policy.target}", self.policy.artifacts.get(files.kind)
-        if name is None or "/" in name:
-            return f"kerv prepare {target}"
-        return " ".join(("kerv", *files.command, target, f"policy.artifacts.{files.kind}={name}"))
+        setting = f"policy.artifacts.{files.kind}"
+        if name and "/" in name:
+            return f"name a folder that holds one, or leave {setting}= out"
+        making = " ".join((*files.command, target, f"{setting}={name}")) if name else f"prepare {target}"
+        return f"run 'kerv {making}', or name a folder that holds one"
 
     def load(self, kind: str) -> Any:
         """Load the policy's artifact of this kind. Further calls in this process return the same object."""
