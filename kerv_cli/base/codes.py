@@ -72,27 +72,22 @@ class FastCode:
 
     @property
     def highest(self) -> int:
-        """Largest absolute value of a rounded coefficient, for actions in [−1, 1]: scale · √H, rounded up."""
         return math.ceil(self.scale * math.sqrt(self.steps))
 
     @property
     def end(self) -> int:
-        """The token that ends a chunk."""
         return 2 * self.highest + 1 + len(self.merges)
 
     @property
     def tokens(self) -> int:
-        """V, number of different tokens."""
         return self.end + 1
 
     @property
     def longest(self) -> int:
-        """Largest number of tokens of a chunk, the end token included."""
         return self.steps * self.dofs + 1
 
     @cached_property
     def parts(self) -> list[tuple[int, ...]]:
-        """For each token, the rounded coefficients that it stands for. The end token stands for none."""
         parts: list[tuple[int, ...]] = [(value,) for value in range(-self.highest, self.highest + 1)]
         for first, second in self.merges:
             parts.append(parts[first] + parts[second])
@@ -100,7 +95,6 @@ class FastCode:
 
     @property
     def spellings(self) -> list[str]:
-        """The text of each token except the end token: a character per rounded coefficient that it stands for."""
         texts = list(map(chr, range(FIRST, FIRST + 2 * self.highest + 1)))
         for first, second in self.merges:
             texts.append(texts[first] + texts[second])
@@ -108,7 +102,6 @@ class FastCode:
 
     @cached_property
     def tokenizer(self) -> Any:
-        """The `tokenizers.Tokenizer` that applies the merges to texts."""
         from tokenizers import Tokenizer, models
 
         texts = self.spellings

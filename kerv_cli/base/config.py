@@ -36,13 +36,6 @@ MOST_POINTS = 10_000
 
 
 def conf_dir() -> Path:
-    """Return the folder of configuration files.
-
-    This is `$KERV_CONF_DIR` if it is set, else `conf/` of the checkout, else `conf/` inside the installed package.
-
-    Raises:
-        UsageError: There is no such folder, or it has no configuration.
-    """
     folder = os.environ.get("KERV_CONF_DIR")
     package = Path(__file__).resolve().parents[1]
     folders = [Path(folder).resolve()] if folder else [package.parent / "conf", package / "conf"]
@@ -63,10 +56,7 @@ def groups() -> dict[str, list[str]]:
 
 
 def _parts_of(group: str) -> dict[str, Part]:
-    """Return the parts that can be chosen in a group of settings, by name.
-
-    For `prefill_draft` these are the proposers that can draft before the target's prefill.
-    """
+    # for prefill_draft: the proposers that can draft before the target's prefill
     if group != "prefill_draft":
         return dict(parts(group))
     return {name: part for name, part in ProposerPart.every().items() if part.when == PREFILL}
@@ -80,9 +70,6 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
         overrides: Arguments as typed: `method=kerv`, `threshold.r=5`, `task=[reach,push]`. Each key at most once.
             `quick=true` adds the command's settings in `conf/quick.yaml`. Typed settings take precedence over these.
         schema: Dataclass of the settings. Its defaults apply to settings that neither a file nor an override sets.
-
-    Raises:
-        UsageError: An override cannot be parsed, its key or a name is unknown, or its value is impossible.
     """
     from omegaconf import OmegaConf
     from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException, ValidationError
@@ -139,11 +126,6 @@ def _owner(key: str) -> str:
 
 
 def _typed(overrides: Sequence[str], schema: type) -> dict[str, Any]:
-    """Parse overrides into a map from key to value. A setting that is a list needs no brackets: `task=a,b`.
-
-    Raises:
-        UsageError: A key is given twice, a setting with a single value is given several, or `task=` is empty.
-    """
     lists = {at.name for at in fields(schema) if str(at.type).startswith("list[")}
     typed: dict[str, Any] = {}
     for override in overrides:
@@ -167,9 +149,6 @@ def preset_file(group: str, name: str) -> Path:
     Args:
         group: `method` or `study`.
         name: Name of a file in `conf/<group>` without its ending, or the path of any file that ends in .yaml or .yml.
-
-    Raises:
-        UnknownName: `conf/<group>` has no such file.
     """
     if name.endswith((".yaml", ".yml")):
         return Path(name).expanduser()
@@ -191,9 +170,6 @@ def _read_preset(group: str, name: str) -> tuple[dict[str, str], list[tuple[str,
     Returns:
         Three values. A map from each group to the part that the file chooses in it. The (key, value) pairs that the
         file sets. A map from each key to its line in the file, written as `FILE:LINE: ` for error messages.
-
-    Raises:
-        UsageError: The file is missing, is not YAML, or chooses a part in the wrong form.
     """
     if not group:
         return {}, [], {}
@@ -212,11 +188,6 @@ def _read_preset(group: str, name: str) -> tuple[dict[str, str], list[tuple[str,
 
 
 def _check(settings: Any) -> None:
-    """Check that every setting is in its range and every chosen part is registered.
-
-    Raises:
-        UsageError: A setting is out of range, a part is not registered, or GROUP.kind was set instead of GROUP.
-    """
     check_settings(settings)
     for group in SETTINGS_GROUPS:
         chosen = getattr(settings, group, None)
@@ -227,11 +198,6 @@ def _check(settings: Any) -> None:
 
 @functools.lru_cache(maxsize=4096)
 def _parsed(override: str) -> Any:
-    """Return an override as parsed by Hydra.
-
-    Raises:
-        UsageError: The override cannot be parsed.
-    """
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
@@ -259,9 +225,6 @@ def _composed(choices: tuple[tuple[str, str], ...], schema: type, conf: Path, ar
         schema: Dataclass of the settings.
         conf: Folder of the configuration files.
         artifacts: Registered kinds of artifacts. The settings of a policy have a key for each of them.
-
-    Raises:
-        UnknownName: A group has no such name.
     """
     from omegaconf import OmegaConf
 
@@ -299,7 +262,6 @@ def _choice(group: str, name: str) -> tuple[Part | None, list[tuple[str, Any]]]:
 
 
 def _open_mappings(node: Any) -> None:
-    """Let overrides add keys to the untyped mappings of a schema, such as `policy.artifacts`."""
     from omegaconf import DictConfig, OmegaConf
 
     for name in node:
@@ -311,7 +273,6 @@ def _open_mappings(node: Any) -> None:
 
 
 def _field(node: Any, key: str) -> Field[Any] | None:
-    """Return the dataclass field that declares the setting `key`. None if no dataclass declares it."""
     from omegaconf import OmegaConf
 
     above, _, name = key.rpartition(".")
@@ -320,7 +281,6 @@ def _field(node: Any, key: str) -> Field[Any] | None:
 
 
 def _keys(node: Any, prefix: str = "") -> Iterator[str]:
-    """Yield the name of every setting in composed settings, such as `threshold.r`."""
     from omegaconf import DictConfig
 
     for name, child in node.items():
@@ -345,18 +305,12 @@ def as_overrides(*overrides: str, **settings: object) -> list[str]:
 
 
 def plain_text(value: object) -> str:
-    """Return a value as it is typed in an override: `[reach,push]`, `true`. None gives `null`."""
     if isinstance(value, list | tuple):
         return f"[{','.join(map(plain_text, value))}]"
     return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def split(text: str) -> list[str]:
-    """Split a line of text into overrides at white space, except inside quotes.
-
-    Raises:
-        UsageError: A quote is not closed, or the line ends with a backslash.
-    """
     try:
         return shlex.split(text)
     except ValueError as error:
@@ -367,9 +321,6 @@ def expand(overrides: Sequence[str]) -> list[list[str]]:
     """Combine all values of the overrides. Return each combination as a list of overrides with one value each.
 
     For example, `threshold.r=0,3` gives two lists. Hydra's other syntax for values works, too, such as `range(0,4)`.
-
-    Raises:
-        UsageError: An override cannot be parsed, or there are no combinations, or more than MOST_POINTS.
     """
     from hydra.errors import HydraException
 
@@ -389,5 +340,4 @@ def expand(overrides: Sequence[str]) -> list[list[str]]:
 
 
 def swept_keys(overrides: Sequence[str]) -> list[str]:
-    """Return the keys of the overrides that have several values, such as `threshold.r=0,3`."""
     return [one.key_or_group for one in map(_parsed, overrides) if one.is_sweep_override()]

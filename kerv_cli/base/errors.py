@@ -57,7 +57,6 @@ class UnknownName(UsageError):
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return `did you mean a or b?` with at most three known names similar to `name`. Empty if none is similar."""
     names = {one.lower(): one for one in known}
     near = [names[one] for one in difflib.get_close_matches(name.lower(), names)]
     return f"did you mean {' or '.join(near)}?" if near else ""

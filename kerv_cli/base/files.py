@@ -81,9 +81,6 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
     Readers see the old file or the complete new one. The parent folder is created. If the block raises an exception,
     the temporary file is removed, and `path` keeps its old content.
-
-    Raises:
-        StorageError: The disk is full or read-only, or permission is missing.
     """
     with _temporary(path) as temporary:
         temporary.touch(exist_ok=False)
@@ -100,9 +97,6 @@ def write_folder(folder: Path, fill: Callable[[Path], object]) -> None:
     Args:
         folder: Path of the finished folder.
         fill: Function that takes the temporary folder, and writes the content into it.
-
-    Raises:
-        StorageError: The disk is full or read-only, or permission is missing.
     """
     with _temporary(folder) as temporary:
         temporary.mkdir()
@@ -120,9 +114,6 @@ def set_aside(folder: Path) -> Path:
 
     The caller then deletes the folder. If the process is killed before that, a later command deletes it. A missing
     folder is no error.
-
-    Raises:
-        StorageError: The disk is full or read-only, or permission is missing.
     """
     temporary = temporary_beside(folder)
     if folder.exists():
@@ -133,7 +124,6 @@ def set_aside(folder: Path) -> Path:
 
 
 def _exchange(a: Path, b: Path) -> None:
-    """Replace folder `b` by folder `a`, in one step if the file system can exchange both."""
     libc = ctypes.CDLL(None, use_errno=True)
     if hasattr(libc, "renameat2"):
         here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
@@ -170,8 +160,6 @@ def unfinished(folder: Path) -> Path:
 
 
 def link_files(folder: Path, new: Path) -> None:
-    """Give the files of a folder second names in another one. Without hard links in the file system, copy them."""
-
     def link(source: str, name: str) -> None:
         try:
             os.link(source, name)
@@ -191,7 +179,6 @@ def visible(folder: Path) -> list[Path]:
 
 
 def sync(path: Path) -> None:
-    """Wait until the disk has stored a file, or a folder's list of names."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -200,11 +187,6 @@ def sync(path: Path) -> None:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file atomically.
-
-    Raises:
-        StorageError: The disk is full or read-only, or permission is missing.
-    """
     with atomic_path(path) as temporary:
         temporary.write_bytes(content)
 
@@ -213,25 +195,17 @@ def write_if_changed(path: Path, content: bytes) -> None:
     """Write a file atomically, unless it has this content already.
 
     So the file's modification time says when its content changed.
-
-    Raises:
-        StorageError: The disk is full or read-only, or permission is missing.
     """
     if not path.is_file() or path.read_bytes() != content:
         write_bytes(path, content)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write text as UTF-8 atomically. The errors are the same as for `write_bytes`."""
     write_bytes(path, text.encode())
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a value as indented JSON atomically. It raises the errors of `write_bytes`, too.
-
-    Raises:
-        ValueError: The value contains NaN or infinity, which JSON cannot express.
-    """
+    """Write a value as indented JSON atomically. It raises the errors of `write_bytes`, too."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
@@ -241,10 +215,6 @@ def regular(path: Path, most: int = MOST_BYTES) -> Path:
     Args:
         path: The file.
         most: Maximum size in bytes.
-
-    Raises:
-        OSError: The file is missing, or it is a folder, a pipe or a device. Reading a pipe could wait forever.
-        ValueError: The file is larger than `most`.
     """
     status = os.stat(path)
     if not stat.S_ISREG(status.st_mode):
@@ -255,25 +225,10 @@ def regular(path: Path, most: int = MOST_BYTES) -> Path:
 
 
 def read_text(path: Path, most: int = MOST_TEXT) -> str:
-    """Return the text of a file.
-
-    Args:
-        path: The file.
-        most: Maximum size in bytes.
-
-    Raises:
-        OSError: The file is missing or not a regular file.
-        ValueError: The file is larger than `most` bytes, or not UTF-8.
-    """
     return regular(path, most).read_text(encoding="utf-8")
 
 
 def read_json(path: Path) -> Any:
-    """Return the value in a JSON file.
-
-    Raises:
-        CheckpointError: The file is missing, not a regular file, too large, or not JSON.
-    """
     try:
         return json.loads(read_text(path))
     except FileNotFoundError as error:
@@ -283,11 +238,6 @@ def read_json(path: Path) -> Any:
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
-    """Return the JSON object (a mapping) in a file. It raises the errors of `read_json`, too.
-
-    Raises:
-        CheckpointError: The JSON value is not an object.
-    """
     value = read_json(path)
     if not isinstance(value, dict):
         raise CheckpointError(f"{path} cannot be read as JSON: it holds no object")
@@ -303,9 +253,6 @@ def read_yaml_lines(path: Path, what: str) -> tuple[dict[str, Any], dict[str, in
 
     Returns:
         The mapping, and the line number of each key. Nested keys are joined by dots, such as `threshold.r`.
-
-    Raises:
-        UsageError: The file cannot be read, is not YAML, contains no mapping, gives a key twice, or is too large.
     """
     import yaml
 
@@ -343,11 +290,7 @@ def read_yaml_lines(path: Path, what: str) -> tuple[dict[str, Any], dict[str, in
 
 
 def sha256_of(path: Path) -> str:
-    """Return the hexadecimal SHA-256 of a file. The result is cached until the file changes.
-
-    Raises:
-        CheckpointError: The file is missing or cannot be read.
-    """
+    """Return the hexadecimal SHA-256 of a file. The result is cached until the file changes."""
     try:
         status = os.stat(path)
         return _sha256(str(path), status.st_ino, status.st_size, status.st_mtime_ns)
@@ -362,7 +305,6 @@ def _sha256(path: str, inode: int, size: int, changed: int) -> str:
 
 
 def temporary_beside(path: Path) -> Path:
-    """Return a new temporary path in the same folder as `path`. Its name contains this machine and process."""
     mark = f"{_host()}.{os.getpid()}-{secrets.token_hex(4)}"
     name = path.name.encode()[:150].decode(errors="ignore")
     return path.with_name(f".{name}.{mark}.tmp")

@@ -61,26 +61,18 @@ def number(
 
 
 def choice(default: str, *names: str, help: str = "") -> Any:
-    """Return a field for a settings dataclass. Its value must be one of `names`."""
     return setting(default, help, names=names)
 
 
 def description(at: Field[Any]) -> str:
-    """Return the description of a setting: its allowed names, if there are any, then its `help` text."""
     return ": ".join(filter(None, (" | ".join(at.metadata.get("names", ())), at.metadata.get("help", ""))))
 
 
 def range_of(at: Field[Any]) -> str:
-    """Return the allowed values of a setting as text, as in `from 1 to 1024`. Empty if the setting has no limits."""
     return _range_text(*at.metadata["limits"]) if "limits" in at.metadata else ""
 
 
 def check_label(label: str) -> str:
-    """Check the label (the name) of a setting in a study, and return the label.
-
-    Raises:
-        UsageError: The label is empty, longer than 1,000 characters, or not one printable line.
-    """
     if not 0 < len(label) <= 1000 or not label.isprintable():
         raise UsageError(f"'{' '.join(label[:80].split())}' names no setting: write one line of text")
     return label
@@ -94,9 +86,6 @@ def check_settings(settings: Any, what: str = "") -> None:
     Args:
         settings: The dataclass.
         what: Name of the dataclass in error messages, such as `runtime`. Empty if it holds all settings of a command.
-
-    Raises:
-        UsageError: A value is not allowed. The message is about the first such value.
     """
     prefix = f"{what}." if what else ""
     for at, element in _declared(type(settings)):  # type: ignore[arg-type]
@@ -117,10 +106,7 @@ def check_settings(settings: Any, what: str = "") -> None:
 
 @functools.cache
 def _declared(kind: type) -> tuple[tuple[Field[Any], type | None], ...]:
-    """Return each field of a dataclass with the type of its elements, such as `int` for `list[int]`.
-
-    The type is None unless the field is a list or a dict of plain values.
-    """
+    # each field, with the type of its elements if it is a list or a dict of plain values, else None
     hints = get_type_hints(kind)
 
     def element(name: str) -> type | None:

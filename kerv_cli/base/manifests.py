@@ -93,7 +93,6 @@ def read_file(kind: type[T], path: Path) -> T:
 
 
 def stamped(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of a JSON file with a hash of all of them, which `read_file` checks."""
     return {**fields, DIGEST: _digest_of(fields)}
 
 

@@ -20,11 +20,6 @@ RESUME = "resume.pt"
 
 
 def results_dir(results: str) -> Path:
-    """Return the path of the results folder, which need not exist.
-
-    Raises:
-        UsageError: The path is a file, or no file system accepts it.
-    """
     path = as_path(results)
     if path.exists() and not path.is_dir():
         raise UsageError(f"results={results} is a file: name a folder")
@@ -36,10 +31,6 @@ def check_writable(results: str) -> Path:
 
     Returns:
         The results folder if it exists, else the nearest existing folder above it.
-
-    Raises:
-        UsageError: The path is a file, or below a file.
-        StorageError: The disk is full or read-only, or permission is missing.
     """
     folder = results_dir(results)
     parent = next(path for path in (folder, *folder.absolute().parents) if path.exists())
@@ -55,13 +46,6 @@ def check_writable(results: str) -> Path:
 
 
 def artifact(results: str, kind: str, name: str) -> Path:
-    """Return the folder of an artifact in the results folder: <results>/artifacts/<kind>/<name>.
-
-    Commands write artifacts only to such folders. To read an artifact that may be elsewhere, use `artifact_or_path`.
-
-    Raises:
-        UsageError: `name` cannot be the name of a folder, for example because it contains a slash.
-    """
     return results_dir(results) / "artifacts" / kind / check_name(name, f"{kind} name")
 
 
@@ -69,15 +53,11 @@ def artifact_or_path(results: str, kind: str, name: str) -> Path:
     """Return the folder from which to read an artifact.
 
     If `name` contains a slash, it is the path of the folder. Otherwise the folder is the result of `artifact`.
-
-    Raises:
-        UsageError: `name` can be neither a folder's name nor a path.
     """
     return as_path(name) if "/" in name else artifact(results, kind, name)
 
 
 def check_name(name: str, what: str) -> str:
-    """Return a name that can be used for a folder. `what` says in the error message what is named."""
     if len(name.encode()) > 200:
         raise UsageError(f"{what} '{name[:40]}…' has {len(name.encode())} bytes: at most 200")
     if not PLAIN_NAME.fullmatch(name):
@@ -88,11 +68,6 @@ def check_name(name: str, what: str) -> str:
 
 
 def as_path(text: str) -> Path:
-    """Return a path that the user typed. `~` becomes the home folder.
-
-    Raises:
-        UsageError: No file system accepts such a path.
-    """
     if "\0" in text or any(len(part.encode()) > 255 for part in text.split("/")) or len(text) > 4000:
         raise UsageError(f"'{text[:80]}…' is no path")
     return Path(text).expanduser()
@@ -116,9 +91,6 @@ def find_target(results: str, name: str) -> Path:
         results: The results folder.
         name: A path of the folder if it contains a slash, else the target's name. A name is first looked up among the
             targets in the results folder, then among the shipped policies.
-
-    Raises:
-        UsageError: There is no such target, or its training is unfinished. The message says how to get the target.
     """
     policies = results_dir(results) / "pretrained"
     folders = [artifact_or_path(results, "target", name)]
@@ -171,9 +143,6 @@ def check_not_shipped(path: Path, word: str) -> None:
     Args:
         path: Folder to write to.
         word: Setting that chooses another folder, such as `policy.artifacts.drafter`. Text for the error message.
-
-    Raises:
-        UsageError: The folder belongs to a shipped policy, and holds no artifact that the user has trained.
     """
     made_here = (path / RESUME).is_file()
     if path.exists() and (path.parent / "target" / "target.json").is_file() and not made_here:
@@ -181,7 +150,6 @@ def check_not_shipped(path: Path, word: str) -> None:
 
 
 def target_names(results: str) -> list[str]:
-    """Return the names of all targets: shipped and unpacked policies, then the targets in the results folder."""
     folder, shipped = results_dir(results), []
     for policies in (shipped_dir(), folder / "pretrained"):
         shipped += [path.parts[-3] for path in policies.glob("[!.]*/target/target.json")]

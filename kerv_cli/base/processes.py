@@ -55,7 +55,6 @@ class Workers(ProcessPoolExecutor):
         super().__init__(count, multiprocessing.get_context("spawn"), begin_worker, (os.getpid(),))
 
     def kill(self) -> None:
-        """End all processes at once, whatever they are doing, and drop all waiting work."""
         processes = list((self._processes or {}).values())
         self.shutdown(wait=False, cancel_futures=True)
         for process in processes:

@@ -118,40 +118,26 @@ class Part:
 
     @classmethod
     def every(cls) -> Mapping[str, Self]:
-        """Return all registered parts of this class by name, in the order of registration."""
         return {name: part for name, part in parts(cls.kind).items() if isinstance(part, cls)}
 
     @classmethod
     def find(cls, name: str, what: str = "") -> Self:
-        """Return a registered part of this kind.
-
-        Args:
-            name: Name of the part.
-            what: What the name stands for, text for the error message. If empty, the message says the kind.
-
-        Raises:
-            UnknownName: No part of this kind has the name. The message suggests similar names.
-        """
         return cast(Self, find(cls.kind, name, what))
 
     @property
     def module(self) -> str:
-        """Name of the module that defines the part. Empty if there is no part, as in `proposer=none`."""
         return getattr(self.code, "__module__", "")
 
     @property
     def origin(self) -> str:
-        """Module and name of the part's class or function, as `module:name`. Empty if there is no part."""
         return "" if self.code is None else f"{self.module}:{self.code.__qualname__}"
 
     @property
     def absent(self) -> bool:
-        """Whether the method has no part of this kind if this name is chosen, as in `proposer=none`."""
         return self.code is None
 
     @property
     def default(self) -> Any:
-        """The part's default settings."""
         return self.settings(kind=self.name)
 
     def check_code(self, group: str, coded: bool) -> None:
@@ -347,11 +333,6 @@ def load(name: str) -> Any:
 
 
 def find(kind: str, name: str, what: str = "") -> Part:
-    """Return the registered part with this kind and name. `Part.find` explains `what`.
-
-    Raises:
-        UnknownName: No part of this kind has the name. The message suggests similar names.
-    """
     by_name = parts(kind)
     if not isinstance(name, str) or name not in by_name:  # a damaged file may hold anything
         raise UnknownName(what or kind, str(name), by_name)
@@ -359,15 +340,6 @@ def find(kind: str, name: str, what: str = "") -> Part:
 
 
 def part_of(group: str, name: str) -> Part:
-    """Return the part with this name in a group of settings.
-
-    Args:
-        group: Name of the group, such as `acceptance`. Parts of the group `prefill_draft` are proposers.
-        name: Name of the part.
-
-    Raises:
-        UnknownName: No such part is registered.
-    """
     return find("proposer" if group == "prefill_draft" else group, name, f"{group}.kind")
 
 
@@ -390,7 +362,6 @@ def parts(kind: str, module: str = "") -> Mapping[str, Part]:
 
 
 def kinds() -> tuple[str, ...]:
-    """Return the kinds of all registered parts."""
     load_plugins()
     _load_all()
     return tuple(_PARTS)
@@ -424,7 +395,6 @@ def load_plugins() -> None:
 
 
 def _line_of(error: Exception) -> str:
-    """Return where a plugin raised an error, as `FILE:LINE: `. Empty if the plugin was not found."""
     if isinstance(error, SyntaxError):
         return f"{error.filename}:{error.lineno}: "
     for one in reversed(traceback.extract_tb(error.__traceback__)[2:]):

@@ -13,7 +13,6 @@ DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch
 
 
 def device_of(settings: RuntimeSettings) -> str:
-    """Return the device: cpu, cuda or cuda:N instead of `auto`. Refuse one that this machine does not have."""
     device = settings.device if settings.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
     if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
         raise UsageError(f"runtime.device={device}: known are cpu, cuda, cuda:N, auto")

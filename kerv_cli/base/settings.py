@@ -17,7 +17,6 @@ S = TypeVar("S")
 
 
 def chosen(kind: str, name: str = "none") -> Callable[[], Any]:
-    """Return a dataclass field's `default_factory`: a function that makes the default settings of the part `name`."""
     return lambda: find(kind, name).default
 
 
@@ -99,10 +98,6 @@ def read_settings(schema: type[S], plain: Mapping[str, Any]) -> S:
         schema: The dataclass.
         plain: Stored settings. The settings of a part, such as `proposer`, become an instance of the part's settings
             class.
-
-    Raises:
-        CheckpointError: A setting is missing, unknown or of a wrong type.
-        UnknownName: A part is not registered, for example because its plugin is not installed.
     """
     settings = manifests.read(schema, plain, "a stored setting")
     for group in SETTINGS_GROUPS:

@@ -92,12 +92,10 @@ class ActionSpace:
 
     @property
     def dofs(self) -> int:
-        """Number of degrees of freedom, D."""
         return len(self.names)
 
     @property
     def tokens(self) -> int:
-        """Number of different action tokens."""
         return self.code.tokens if self.code else self.bins - 1 + self.end_token
 
     @property
@@ -150,9 +148,6 @@ class ActionSpace:
 
         Args:
             name: Name of the group.
-
-        Raises:
-            KervError: There is no such group.
         """
         first = 0
         for group in self.groups:
@@ -196,7 +191,6 @@ class ActionSpace:
         return np.clip(2.0 * (actions - low) / (high - low) - 1.0, -1.0, 1.0)
 
     def unnormalise(self, values: np.ndarray) -> np.ndarray:
-        """Map normalised actions (..., D) in [-1, 1] to environment units."""
         low, high = np.asarray(self.low), np.asarray(self.high)
         return (values + 1.0) / 2.0 * (high - low) + low
 
@@ -205,7 +199,6 @@ class ActionSpace:
         return np.clip(np.digitize(values, self.edges) - 1, 0, self.tokens - 1).astype(np.int64)
 
     def values_of(self, tokens: np.ndarray) -> np.ndarray:
-        """Return the normalised values of tokens: the centres of their bins."""
         return self.centres[np.asarray(tokens)]
 
     def encode(self, actions: np.ndarray) -> np.ndarray:
@@ -217,7 +210,6 @@ class ActionSpace:
         return self.unnormalise(self.values_of(tokens))
 
     def longest(self, steps: int) -> int:
-        """Return N, the largest number of tokens of a chunk of `steps` control steps."""
         return self.code.longest if self.code else steps * self.dofs
 
     def chunk_tokens(self, chunks: np.ndarray) -> np.ndarray:
@@ -243,7 +235,6 @@ class ActionSpace:
         return self.code.values(self.code.decode(tokens))[:steps]
 
     def fitted(self, actions: np.ndarray) -> ActionSpace:
-        """Return this space with the 1st and 99th percentile of actions (n, D) as its limits."""
         low, high = action_limits(*np.percentile(actions, [1, 99], axis=0))
         return replace(self, low=low, high=high)
 
@@ -256,9 +247,6 @@ class ActionSpace:
             there: What the other space belongs to, text for the error message.
             statistics: Whether to compare `low`, `high`, `end_token` and `code`, too. If these differ, the same token
                 means a different action.
-
-        Raises:
-            CheckpointError: The spaces differ. The message names the first difference.
         """
         normalisation = ("low", "high", "end_token", "code") if statistics else ()
         for name in ("names", "groups", "strict", "bins", "control_hz", *normalisation):
@@ -360,5 +348,4 @@ class Observation:
     readings: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def with_images(self, images: Mapping[str, np.ndarray]) -> Observation:
-        """Return a copy of the observation with these images instead."""
         return replace(self, images=images)

@@ -45,11 +45,7 @@ def packed(value: object, text_keys: bool = False) -> bytes:
 
 
 def unpacked(frame: bytes | str) -> Message:
-    """Decode a client's message with msgpack. A PNG or JPEG image becomes a function that returns the decoded image.
-
-    Raises:
-        UsageError: The message is not a msgpack map with text keys, or the bytes of an array do not fit its shape.
-    """
+    """Decode a client's message with msgpack. A PNG or JPEG image becomes a function that returns the decoded image."""
     import msgpack
 
     if isinstance(frame, str):
@@ -66,11 +62,7 @@ def unpacked(frame: bytes | str) -> Message:
 
 
 def _value(value: dict[Any, Any]) -> object:
-    """Decode a map inside a message, if it encodes an array, a number or an image. Return any other map unchanged.
-
-    A PNG or JPEG image becomes a function that decodes the image when called, because most images are never used. A raw
-    image becomes an array.
-    """
+    # a PNG or JPEG image becomes a function that decodes it when called, because most images are never used
     items = {}
     for key, item in value.items():
         items[key.decode() if isinstance(key, bytes) else key] = item
@@ -85,16 +77,6 @@ def _value(value: dict[Any, Any]) -> object:
 
 
 def _array(name: object, shape: Any, data: Any) -> np.ndarray:
-    """Build an array from its dtype, shape and bytes, as a message encodes them.
-
-    Args:
-        name: Name of the dtype, which must be a bool, integer or float type.
-        shape: List of integers.
-        data: The array's bytes.
-
-    Raises:
-        UsageError: The dtype is no bool, integer or float type, or the bytes do not fit shape and type.
-    """
     dtype = _dtype(name)
     try:
         return np.frombuffer(data, dtype).reshape(shape).copy()  # an array over bytes would be read-only
@@ -104,11 +86,6 @@ def _array(name: object, shape: Any, data: Any) -> np.ndarray:
 
 
 def _dtype(name: object) -> np.dtype:
-    """Return the dtype with this name.
-
-    Raises:
-        UsageError: There is no bool, integer or float type with this name.
-    """
     try:
         dtype = np.dtype(name) if isinstance(name, str) else None
     except TypeError:
@@ -119,11 +96,7 @@ def _dtype(name: object) -> np.dtype:
 
 
 def _image(data: Any) -> np.ndarray:
-    """Decode a PNG or JPEG file to an array, which is (height, width, 3) for a colour image.
-
-    Raises:
-        UsageError: The file is neither PNG nor JPEG, is damaged, or its image is too large.
-    """
+    """Decode a PNG or JPEG file to an array, which is (height, width, 3) for a colour image."""
     from PIL import Image
 
     try:
