@@ -67,11 +67,9 @@ class Profile:
     about: Mapping[str, Any] = field(default_factory=dict)
 
     def lacks(self, kinds: Iterable[str]) -> list[str]:
-        """Return the kinds of costs among `kinds` for which the profile has no times."""
         return [kind for kind in kinds if not self.phases.get(kind, ((), ()))[0]]
 
     def seconds(self, kind: str, rows: int) -> float:
-        """Return the seconds of one forward or draft of this kind over `rows` tokens."""
         return float(self.times(kind, np.array([rows]))[0])
 
     def times(self, kind: str, rows: np.ndarray) -> np.ndarray:
@@ -92,22 +90,16 @@ class Profile:
         return seconds
 
     def decode(self, tokens: int) -> float:
-        """Return the seconds of one autoregressive decode of `tokens` tokens."""
         first = self.seconds("encode", 1) + self.seconds("prefill", self.prompt)
         return first + (tokens - 1) * self.seconds("verify", 1)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the profile as a dictionary that JSON can store."""
         phases = {kind: {"rows": list(rows), "seconds": list(seconds)} for kind, (rows, seconds) in self.phases.items()}
         return {"format": FORMAT, "prompt": self.prompt, "tokens": self.tokens, "phases": phases}
 
 
 def read_profile(path: Path) -> Profile:
-    """Read the latency profile from a JSON file that `kerv bench` has written.
-
-    Raises:
-        CheckpointError: The file is missing, holds no profile, has another format, or holds impossible times.
-    """
+    """Read the latency profile from a JSON file that `kerv bench` has written."""
     document = read_json(path)
     try:
         stored = document["profile"]
@@ -161,7 +153,6 @@ class Work:
 
     @property
     def needs(self) -> list[str]:
-        """Kinds of costs that a profile must contain, so that `prices` can estimate the seconds of this work."""
         return [*self.calls, *self.sources]
 
 
@@ -214,7 +205,6 @@ def work_of(rounds: Columns, counts: np.ndarray, phases: Columns, looked_up: np.
 
 
 def work_of_record(decode: DecodeRecord) -> Work:
-    """Return what a single decode computed (forwards, drafts, other seconds), from its record."""
     columns = {name: np.array(list(map(attrgetter(name), decode.rounds))) for name in COUNTED}
     phases = {name: np.array([decode.phases.get(name, float(name == "vision"))]) for name in READ_PHASES}
     searched = np.array([decode.similarity is not None])

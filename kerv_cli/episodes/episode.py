@@ -114,7 +114,6 @@ class _Execution:
                 self.places.setdefault(place.name, []).append(state[place.first : place.first + 3])
 
     def step(self) -> None:
-        """Execute one control step."""
         if self.chunk:
             self.last = self.chunk.popleft()
         self.world.step(self.last)
@@ -126,20 +125,11 @@ class _Execution:
         self.follower.observe(self.actions[-1], self.path[-1])
 
     def until(self, rest: int) -> None:
-        """Execute the chunk until only `rest` of its actions are left, or the episode ends."""
         while len(self.chunk) > rest and not self.world.done:
             self.step()
 
     def during(self, delay: Delay) -> Delay:
-        """Let the world go on while a decode runs.
-
-        Args:
-            delay: How long the decode takes.
-
-        Returns:
-            The delay with `carried` and `held` filled in. `carried` is the number of steps that executed the rest of
-            the previous chunk. `held` is the number of steps that repeated the last action.
-        """
+        # carried: steps that executed the rest of the previous chunk; held: steps that repeated the last action
         before, in_chunk = len(self.actions), len(self.chunk)
         while len(self.actions) < before + delay.steps and not self.world.done:
             self.step()

@@ -70,20 +70,14 @@ class Setting:
 
     @property
     def depends_on_order(self) -> bool:
-        """Whether an episode's result depends on earlier episodes of its block (episodes that one process runs).
-
-        This is so if a skip rule adapts its similarity threshold after each episode (docs/methods.md §4.3).
-        """
         skip = self.settings["skip"]
         return bool(skip.get("up") or skip.get("down"))
 
     @property
     def batch(self) -> int:
-        """Number of episodes that run at the same time. If it is more than 1, the episodes are not timed."""
         return int(self.settings["rollout"]["batch"])
 
     def on(self, *tasks: str) -> RolloutSettings:
-        """Return the settings of a rollout that runs this setting on the given tasks."""
         return read_settings(RolloutSettings, {**self.settings, "task": list(tasks)})
 
 
@@ -104,17 +98,11 @@ def differences(new: Setting, old: Setting | None) -> str:
 
 
 def _differing(new: Mapping[str, Any], old: Mapping[str, Any]) -> list[str]:
-    """Return the keys that have different values in two mappings. A missing key has the value None."""
     return [key for key in dict.fromkeys([*new, *old]) if new.get(key) != old.get(key)]
 
 
 def hash_of(value: object) -> str:
-    """Return a short hash of a JSON value: the first 16 hexadecimal digits of the SHA-256 of its canonical JSON text.
-
-    Raises:
-        ValueError: The value contains NaN or infinity.
-        TypeError: The value contains an object that JSON cannot hold.
-    """
+    """Return a short hash of a JSON value: the first 16 hexadecimal digits of the SHA-256 of its canonical JSON text."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     return hashlib.sha256(text.encode("ascii")).hexdigest()[:16]
 
@@ -133,7 +121,6 @@ def work_of(settings: Plain, identity: Identity) -> str:
 
 
 def determining(settings: Plain) -> dict[str, Any]:
-    """Return the settings that are part of a setting's hash: all but NOT_DETERMINING."""
     return {**without(settings, NOT_DETERMINING), "runtime": without(settings["runtime"], NOT_DETERMINING_RUNTIME)}
 
 
@@ -148,13 +135,11 @@ def stress_of(settings: Plain) -> dict[str, Any]:
 
 
 def stress_text(settings: Plain) -> str:
-    """Return text to put after a setting's label: `, stress push 2`. Empty without stress."""
     stress = stress_of(settings)
     return f", stress {stress['kind']} {stress['level']}" if stress["level"] else ""
 
 
 def flat(settings: Plain, prefix: str = "") -> dict[str, Any]:
-    """Return nested settings with dotted keys: {"threshold": {"r": 5}} becomes {"threshold.r": 5}."""
     pairs: dict[str, Any] = {}
     for key, value in settings.items():
         pairs |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
@@ -162,5 +147,4 @@ def flat(settings: Plain, prefix: str = "") -> dict[str, Any]:
 
 
 def without(settings: Plain, names: Collection[str]) -> dict[str, Any]:
-    """Return the settings without the keys in `names`. Only the top level is searched."""
     return {key: value for key, value in settings.items() if key not in names}

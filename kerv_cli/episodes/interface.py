@@ -32,7 +32,6 @@ class Picture:
     resize: str = choice("bilinear", "bilinear", "lanczos")
 
     def of(self, image: np.ndarray) -> np.ndarray:
-        """Return a camera's image (h, w, 3) uint8 as the server wants it, with black borders if its sides differ."""
         image = image[:, ::-1] if self.mirror else image
         if not self.size or image.shape[0] == self.size:
             return np.ascontiguousarray(image)
@@ -76,7 +75,6 @@ class Interface:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras, each once."""
         return tuple(dict.fromkeys(one.camera for one in self.images.values()))
 
     @property
@@ -100,7 +98,6 @@ class Interface:
             raise UsageError(f"gripper={self.gripper}: {spec.name} has no gripper, write as_is")
 
     def message(self, spec: EnvironmentSpec, observation: Observation) -> dict[str, Any]:
-        """Return the message for an observation."""
         message: dict[str, Any] = {key: one.of(observation.images[one.camera]) for key, one in self.images.items()}
         own = dict(zip(spec.observation.proprioception, observation.proprioception, strict=True))
         offered = {**own, **observation.readings, STATE: observation.state}
@@ -133,7 +130,6 @@ class Interface:
 
 
 def read_interface(name: str) -> Interface:
-    """Read an interface: a name in conf/interface, or the path of a YAML file."""
     path = preset_file("interface", name)
     content, _ = read_yaml_lines(path, f"policy.interface={name}")
     try:

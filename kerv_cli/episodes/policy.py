@@ -38,10 +38,6 @@ WARM_UP_DECODES = 6
 
 
 def artifacts_of(settings: MethodSettings) -> Artifacts:
-    """Return the policy's files (weights, datastore, …). Each is loaded onto the device of the settings when needed.
-
-    All settings in this process share the loaded objects.
-    """
     device, _ = set_up(settings.runtime)
     return Artifacts(settings.results, settings.policy, device, settings.runtime.dtype)
 
@@ -56,11 +52,6 @@ def check(settings: RolloutSettings, is_awaited: bool = False) -> dict[str, str]
     Returns:
         What determines the results, apart from the settings: hashes of files with weights or data, by the kind of file.
         The key `observation` says what the policy observes, such as `vision`.
-
-    Raises:
-        UsageError: There is no such policy, a number is out of range, a seed is a training seed, the policy was trained
-            on another camera, or parts do not fit together.
-        CheckpointError: The policy is damaged, or an artifact is missing or belongs to another target or action space.
     """
     tasks = resolve_tasks(settings.task)
     spec = spec_of(tasks[0])
@@ -108,7 +99,6 @@ def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
 
 
 def _check_remote(settings: RolloutSettings, spec: EnvironmentSpec, is_awaited: bool) -> dict[str, str]:
-    """Ask the server what it serves. Return what determines its results, see `check`."""
     metadata = metadata_of(settings.policy.url, is_awaited)
     interface = read_interface(settings.policy.interface).adapted(metadata, settings.policy.execute)
     interface.check(spec, settings.world)
@@ -119,11 +109,6 @@ def _check_remote(settings: RolloutSettings, spec: EnvironmentSpec, is_awaited: 
 
 
 def _check_undecoded(settings: RolloutSettings) -> None:
-    """Refuse settings that need a decoding method, because the expert decodes nothing, and a server in its own way.
-
-    Raises:
-        UsageError: Such a setting has another value than its default.
-    """
     plain, default = (
         {"rollout.batch": each.rollout.batch, "deviation_every": each.deviation_every, "chunk": each.chunk}
         | each.parts()
@@ -137,12 +122,7 @@ def _check_undecoded(settings: RolloutSettings) -> None:
 
 
 def decoder_for(settings: RolloutSettings, task: str) -> Follower:
-    """Return the decoder for one setting (a method with all its options) on one task, warmed up.
-
-    Raises:
-        UsageError: The settings cannot run; `check` lists the reasons.
-        CheckpointError: The policy is damaged, or an artifact is missing or belongs to another target or action space.
-    """
+    """Return the decoder for one setting (a method with all its options) on one task, warmed up."""
     spec = spec_of(task)
     if settings.policy.kind == REMOTE:
         return RemoteDecoder(settings.policy, read_interface(settings.policy.interface), spec)
@@ -206,16 +186,10 @@ def _profile_latency(settings: RolloutSettings, target: TargetDescription | None
 
 
 def profiled(profile: Profile, scale: float = 1.0) -> Latency:
-    """Return a function that computes the latency of a decode from the costs in `profile`, multiplied by `scale`."""
     return lambda decode: scale * float(prices(work_of_record(decode), profile)[0])
 
 
 def _profile_path(settings: RolloutSettings) -> Path:
-    """Return the path of `rollout.profile`, which is a file or a name in <results>/bench.
-
-    Raises:
-        UsageError: There is no such file.
-    """
     name, results = settings.rollout.profile, settings.results
     for path in (Path(name).expanduser(), results_dir(results) / "bench" / f"{name}.json"):
         if path.is_file():
@@ -224,7 +198,6 @@ def _profile_path(settings: RolloutSettings) -> Path:
 
 
 def still_observation(decoder: Follower, space: ObservationSpace, pixels: int) -> Observation:
-    """Return an observation of zeros, with every input that the decoder reads. Images are `pixels` × `pixels`."""
     images = {name: np.zeros(frame_shape(name, pixels), dtype=np.uint8) for name in decoder.cameras}
     return Observation(np.zeros(len(space.proprioception)), np.zeros(space.state), "", images)
 
@@ -261,11 +234,7 @@ class ExpertDecoder(Follower):
         self.task, self.expert = task, spec.expert(task)
 
     def decode(self, observation: Observation) -> DecodeRecord:
-        """Return a record with the action of one control step, (1, D), environment units.
-
-        Raises:
-            KervError: The expert did not return D finite numbers.
-        """
+        """Return a record with the action of one control step, (1, D), environment units."""
         stopwatch = Stopwatch(torch.device("cpu"))
         action = self.expert(observation)
         seconds = stopwatch.stop()

@@ -61,7 +61,6 @@ class Server:
         self._counted = 0, 0
 
     def connect(self) -> Message:
-        """Connect anew, and return the metadata. Raise Lost if the server cannot be reached within CONNECT_S."""
         self.close()
         try:
             from websockets.exceptions import ConnectionClosed, InvalidURI, WebSocketException
@@ -96,7 +95,6 @@ class Server:
         return metadata
 
     def close(self) -> None:
-        """End the connection."""
         self._stack.close()
         self._connection = None
 
@@ -125,7 +123,6 @@ class Server:
                 time.sleep(min(1.0, RECONNECT_S / 10))
 
     def ask(self, message: Message) -> Message:
-        """Return the answer to a message. Raise Lost if the connection ends before."""
         if self._connection is None:
             raise Lost(f"{self.url} is not connected")
         from websockets.exceptions import ConnectionClosed
@@ -203,7 +200,6 @@ def _reason(error: Any) -> str:
 
 
 def _last_line(text: str) -> str:
-    """Return the last line of a text, which of a traceback is the error."""
     return (text.strip().splitlines() or ["it is empty"])[-1][:200]
 
 
@@ -217,21 +213,15 @@ _servers: dict[str, Server] = {}
 
 
 def server_at(url: str) -> Server:
-    """Return this process's connection to a server, which may not be open yet."""
     return _servers.setdefault(url, Server(url))
 
 
 def close_servers() -> None:
-    """End all connections of this process."""
     while _servers:
         _servers.popitem()[1].close()
 
 
 def metadata_of(url: str, is_awaited: bool = False) -> Message:
-    """Return what a server says about its policy now. Decoders of the same policy connect again when they ask.
-
-    A server that is awaited, because it was there when a study was planned, may be away for RECONNECT_S.
-    """
     server = server_at(url)
     try:
         metadata = server.reached(time.monotonic(), RECONNECT_S) if is_awaited else server.connect()
@@ -255,12 +245,10 @@ class RemoteDecoder(Follower):
         self._sent = self._done = 0  # actions of the last answer, and those that were executed since
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
-        """Start a new episode."""
         super().reset(task, seed, end_effector)
         self._begins = True
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
-        """Count an action that was executed."""
         super().observe(action, end_effector)
         self._done += 1
 
@@ -284,7 +272,6 @@ class RemoteDecoder(Follower):
         return DecodeRecord((), actions, forwards, (), REMOTE, seconds, phases, served=served)
 
     def _answered(self, observation: Observation) -> tuple[float, Message]:
-        """Return the time of time.perf_counter before the question, and the answer."""
         for attempt in range(ATTEMPTS):
             began = time.perf_counter()
             message = self.interface.message(self.spec, observation)

@@ -53,13 +53,6 @@ class Point:
 
     @classmethod
     def of(cls, name: str, overrides: Sequence[str], varied: Collection[str]) -> Point:
-        """Build one point of a grid.
-
-        Args:
-            name: Name of the grid.
-            overrides: The point's overrides, `key=value`.
-            varied: Keys that differ within the grid.
-        """
         varies = {}
         for override in overrides:
             key, value = override.lstrip("+").split("=", 1)
@@ -69,7 +62,6 @@ class Point:
 
     @property
     def label(self) -> str:
-        """The grid's name and the point's values, such as `spec_vla r=3`."""
         words = [self.name]
         for key, value in self.varies.items():
             words.append(f"{key.rpartition('.')[2]}={value}")
@@ -87,25 +79,18 @@ class ResolvedStudy:
 
     @property
     def study(self) -> StudySettings:
-        """The study's own settings, such as its baseline and block size."""
         return self.sweep.study
 
     @property
     def first(self) -> RolloutSettings:
-        """The first setting. Used for values that all settings share, such as the results folder."""
         return next(iter(self.settings.values()))
 
     @functools.cached_property
     def tasks(self) -> tuple[str, ...]:
-        """Full names of the tasks. They are the same for all settings."""
         return resolve_tasks(self.first.task)
 
     @property
     def unseen(self) -> dict[str, list[str]]:
-        """For each target of the study, the study's tasks that this target was not trained on.
-
-        Targets that do not name their training tasks, or were trained on all tasks of the study, are left out.
-        """
         found: dict[str, list[str]] = {}
         for one in self.settings.values():
             trained = () if one.policy.target in found else trained_tasks(one)
@@ -124,10 +109,6 @@ def resolve(
             configure the sweep. `results` and all other overrides apply to every setting of the study.
         command: The command that runs the study, with `_` instead of a space.
         schema: Dataclass of the command's settings.
-
-    Raises:
-        UsageError: A key or name is unknown. Or the study has no settings or lacks its baseline. Or one of its settings
-            sets a key that the command line sets, too. Or a label is empty, too long or not one line.
     """
     of_sweep, of_settings = [], []
     for override in overrides:
@@ -159,11 +140,6 @@ def resolve(
 
 
 def _points(study: StudySettings, path: Path, typed: Collection[str]) -> dict[str, Point]:
-    """Expand every entry of the study's `settings` into the points of its grid. Return the points by label.
-
-    Raises:
-        UsageError: The study has no settings or lacks its baseline, or it sets a key of the command line (`typed`).
-    """
     points: dict[str, Point] = {}
     for name, text in study.settings.items():
         with _line_of(path, (), f"settings.{name}"):
@@ -187,13 +163,9 @@ def _points(study: StudySettings, path: Path, typed: Collection[str]) -> dict[st
 
 @contextmanager
 def _line_of(path: Path, typed: Collection[str], place: str, others: Mapping[str, str] = {}) -> Iterator[None]:
-    """Add the study's file and line to the message of a UsageError that is raised inside this `with` block.
+    """Add the study's file and line to a UsageError that is not about a `typed` key.
 
-    Args:
-        path: The study's file.
-        typed: Keys on the command line. An error about one of these gets no file and line.
-        place: Key in the file to which the error belongs, such as `settings.ar`.
-        others: Maps a setting to the key in the file that replaces `place` if the error is about this setting.
+    `place` is the key in the file, such as `settings.ar`. `others` maps settings to keys that replace it.
     """
     try:
         yield
@@ -213,9 +185,6 @@ def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
     Args:
         overrides: The command line's `key=value` arguments.
         multirun: Whether -m was given.
-
-    Raises:
-        UsageError: A key or name is unknown, a value is impossible, or `results` has several values.
     """
     tasks, others = _parted(overrides, {"task"})
     swept = swept_keys(others) if multirun else []
@@ -248,9 +217,6 @@ def repeating_words(setting: Setting, task: str, seeds: Sequence[int]) -> list[s
         setting: The stored setting.
         task: Name of the task.
         seeds: Seeds of the episodes, which must be successive.
-
-    Raises:
-        UsageError: No command repeats the episodes, because the presets in conf/ have changed or the seeds have gaps.
     """
     if list(seeds) != list(range(seeds[0], seeds[0] + len(seeds))):
         raise UsageError("its skip rule adapts from episode to episode, and the seeds before it have gaps")
@@ -267,20 +233,6 @@ def repeating_words(setting: Setting, task: str, seeds: Sequence[int]) -> list[s
 
 
 def _settle(settings: Iterable[RolloutSettings], baseline: RolloutSettings, narrows: bool = False) -> None:
-    """Fill in the tasks, camera and horizon of settings that do not name them.
-
-    The tasks are the baseline's. Camera and horizon are the environment's defaults.
-
-    Args:
-        settings: The settings to change.
-        baseline: The baseline's settings.
-        narrows: Whether to keep, in all settings, only the baseline's tasks that its target was trained on. If no task
-            is left, all tasks that this target was trained on are used.
-
-    Raises:
-        UnknownName: A task does not exist, or the environment has no such camera.
-        UsageError: The horizon is longer than the simulator can run.
-    """
     tasks = list(tasks_of(baseline))
     trained = list(trained_tasks(baseline)) if narrows else []
     narrowed = [task for task in tasks if task in trained] or trained
@@ -380,10 +332,6 @@ def tasks_of(settings: RolloutSettings) -> tuple[str, ...]:
     """Return the full names of a rollout's tasks. By default they are the tasks that its target was trained on.
 
     If the target does not name its training tasks, the default is DEFAULT_TASKS.
-
-    Raises:
-        UnknownName: A task does not exist.
-        CheckpointError: The target's description is damaged.
     """
     return resolve_tasks(settings.task or list(trained_tasks(settings)) or DEFAULT_TASKS)
 
@@ -392,9 +340,6 @@ def trained_tasks(settings: RolloutSettings) -> tuple[str, ...]:
     """Return the full names of the tasks that a rollout's target was trained on.
 
     Empty for the expert, for a target that does not name its tasks, and for a missing target (refused elsewhere).
-
-    Raises:
-        CheckpointError: The target's description is damaged.
     """
     if settings.policy.kind != MODEL:
         return ()
@@ -409,15 +354,6 @@ def trained_tasks(settings: RolloutSettings) -> tuple[str, ...]:
 
 
 def study_name(study: str) -> str:
-    """Return the name under which the results of `kerv sweep study=STUDY` are stored.
-
-    Args:
-        study: Name of a preset, or path of a file. For a file the result is its `name:` entry, or else the file's name
-            without suffix.
-
-    Raises:
-        UsageError: The file exists but is not a study.
-    """
     path = Path(study).expanduser()
     if path.suffix not in (".yaml", ".yml"):
         return study
@@ -436,13 +372,11 @@ def located(words: Sequence[str]) -> list[str]:
 
 
 def _outranked(overrides: Iterable[str], by: Sequence[str]) -> list[str]:
-    """Combine two lists of overrides. If both contain a key, the value in `by` counts."""
     _, others = _parted(overrides, set(map(_key, by)))
     return [*others, *by]
 
 
 def _parted(overrides: Iterable[str], keys: Collection[str]) -> tuple[list[str], list[str]]:
-    """Return the overrides whose key is one of `keys`, and the others."""
     named: list[str] = []
     others: list[str] = []
     for override in overrides:

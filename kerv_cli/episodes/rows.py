@@ -22,7 +22,6 @@ Fields = dict[str, tuple[pa.DataType, Callable[..., Any]]]
 
 
 def _summed(value: Callable[[DecodeRecord], Any]) -> Callable[[EpisodeRecord], Any]:
-    """Return a function that sums a value over an episode's decodes. None counts as 0."""
     return lambda episode: sum(value(decode) or 0 for decode in episode.decodes)
 
 
@@ -40,7 +39,6 @@ def _judged(value: Callable[[Round], int], *served: str) -> Callable[[EpisodeRec
 
 
 def _delay(name: str) -> Callable[[DecodeRecord], Any]:
-    """Return a function that reads the attribute `name` of a decode's `delay`. It returns None if the world waited."""
     return lambda decode: getattr(decode.delay, name, None)
 
 
@@ -63,7 +61,6 @@ def _looks_up(one: Round) -> bool:
 
 
 def _executed(episode: EpisodeRecord, count: Callable[[DecodeRecord, int, int], int]) -> int:
-    """Sum `count` over the control steps of each chunk that were executed."""
     return sum(count(one, *steps) for one, steps in zip(episode.decodes, episode.executed, strict=True))
 
 
@@ -144,7 +141,6 @@ DECODE_SCHEMA = pa.schema([("index", INT), ("step", INT), *_schema(_DECODE)])
 
 
 def episode_row(record: EpisodeRecord) -> dict[str, Any]:
-    """Return the columns of one episode as JSON values. NaN becomes None. In lists, infinity becomes None, too."""
     return {name: _plain(value) for name, value in _row(_EPISODE, record).items()}
 
 
@@ -164,19 +160,12 @@ def decodes_table(record: EpisodeRecord) -> pa.Table:
 
 
 def table_blob(table: pa.Table) -> bytes:
-    """Return a table as the bytes of a compressed Parquet file."""
     buffer = io.BytesIO()
     pq.write_table(table, buffer, compression="zstd")
     return buffer.getvalue()
 
 
 def read_decodes(blob: bytes, columns: Sequence[str] | None = None) -> pa.Table:
-    """Read a table of decodes from bytes that `table_blob` returned.
-
-    Args:
-        blob: The bytes of a Parquet file.
-        columns: Names of the columns to read. None for all.
-    """
     return pq.read_table(io.BytesIO(blob), columns=columns, use_threads=False)
 
 
@@ -187,7 +176,6 @@ _SAME = (
 
 
 def decode_records(table: pa.Table) -> list[DecodeRecord]:
-    """Return one record for each row of a table that `decodes_table` made."""
     return list(map(_decode_record, table.to_pylist()))
 
 

@@ -71,7 +71,6 @@ def new_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) ->
 
 
 def close_worlds() -> None:
-    """Close every world that `open_world` keeps open, and the connections to servers."""
     while _opened:
         _opened.popitem()[1].close()
     close_servers()
@@ -91,12 +90,6 @@ class Runner:
         self._recording = dataclasses.replace(settings.world.camera, size=settings.record_size, supersample=1)
 
     def episode(self, seed: int, recorded: bool = False) -> EpisodeRecord:
-        """Run one episode, and return its record.
-
-        Args:
-            seed: Seed of the initial state.
-            recorded: Whether the record keeps images.
-        """
         world = open_world(self.task, self.settings.world, self.stress)  # another runner may have closed it since
         return run_episode(world, self.decoder, seed, self._recording if recorded else None, self.clock)
 
@@ -156,17 +149,6 @@ def run_together(
 def _one_after_another(
     state: Follower, waiting: list[Request[K]], ended: list[EpisodeEnd[K]], open_world: OpenWorld
 ) -> Generator[Observation, DecodeRecord, None]:
-    """Run waiting episodes one after another, until none is left.
-
-    A batch runs several of these generators at once, one in each of its slots. The generator yields observations. Send
-    it the record of each observation's decode.
-
-    Args:
-        state: Follows the episodes of this slot of the batch, one after another.
-        waiting: Requests that have not begun, shared by all slots. A slot takes requests of the same task if it can.
-        ended: List to which each request is appended when its episode ends, with the episode's record or error.
-        open_world: Opens a world for a task.
-    """
     world: World | None = None
     try:
         while waiting:
@@ -190,22 +172,12 @@ def _one_after_another(
 
 
 def _take(waiting: list[Request[K]], task: str) -> Request[K]:
-    """Remove a waiting request of `task` from the list, and return it.
-
-    If no request of `task` is waiting, take a request of the task with the most waiting requests.
-    """
     tasks = [request.task for request in waiting]
     wanted = task if task in tasks else Counter(tasks).most_common(1)[0][0]
     return waiting.pop(tasks.index(wanted))
 
 
 def run_batch(settings: RolloutSettings, requests: Iterable[Request[K]]) -> Iterator[EpisodeEnd[K]]:
-    """Run episodes of one setting, `rollout.batch` at a time, without recording images. Yield as `run_together` does.
-
-    Args:
-        settings: The rollout's settings.
-        requests: The episodes to run, of any tasks.
-    """
     decoder, world = BatchDecoder(method_decoder(settings)), settings.world
     return run_together(
         decoder, requests, settings.rollout.batch, lambda task: new_world(task, world, build_stress(world.stress))
@@ -213,11 +185,6 @@ def run_batch(settings: RolloutSettings, requests: Iterable[Request[K]]) -> Iter
 
 
 def is_recorded(settings: RolloutSettings, seed: int) -> bool:
-    """Return whether images of the episode with this seed are recorded.
-
-    The first `settings.record` episodes of each task are recorded, or all if this number is negative. Episodes that run
-    in a batch are never recorded.
-    """
     return settings.rollout.batch == 1 and (settings.record < 0 or seed - settings.seed < settings.record)
 
 

@@ -36,10 +36,6 @@ class TimingSettings:
 
         Args:
             prefix: Text before each setting's name in the error message: `rollout.`.
-
-        Raises:
-            UsageError: latency=profile without a profile, ar_ms with measured latencies, or a batch with clock=real
-                (decodes of a batch have no times).
         """
         if self.batch > 1 and self.clock == REAL:
             raise UsageError(
@@ -81,7 +77,6 @@ class RolloutSettings(MethodSettings, TaskSettings):
             self.policy.target = self.policy.name or self.policy.url
 
     def check_together(self, prefix: str) -> None:
-        """Refuse a method of a policy whose server chooses it."""
         if self.policy.kind == REMOTE and self.method != REMOTE:
             raise UsageError(f"method={self.method} with policy=remote: the server decides it, leave it out", "method")
 
