@@ -107,7 +107,6 @@ class EnvironmentSpec:
     experts: Mapping[str, str] = field(default_factory=dict)
 
     def full_name(self, task: str) -> str | None:
-        """Return the full name of a task, given its full or short name. None if there is no such task."""
         return next((name for name in (task, task + self.suffix) if name in self.tasks), None)
 
     def task(self, name: str) -> Task:
@@ -243,7 +242,6 @@ class EnvironmentSpec:
             )
 
     def expert(self, task: str) -> Expert:
-        """Return the scripted expert of a task. Raise UsageError if there is none."""
         self.check_experts([task])
         return load(self.expert_class)(self, task)
 

@@ -96,7 +96,6 @@ class Stress:
         return action
 
     def see(self, camera: str, image: NDArray[np.uint8], step: int) -> NDArray[np.uint8]:
-        """Return what the policy sees of an undisturbed image (size, size, 3). `camera` is the name of the view."""
         return image
 
 

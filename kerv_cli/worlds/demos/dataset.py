@@ -217,7 +217,6 @@ class DemoDataset:
         return cls(parts[0].path, replace(first, sha256=combined, config=config, tasks=tasks), episodes)
 
     def of_tasks(self, *tasks: str) -> list[int]:
-        """Return the indices in `episodes` of all episodes of some tasks, given by full names."""
         return [index for index, entry in enumerate(self.episodes) if entry.task in tasks]
 
     def load(self, index: int) -> DemoEpisode:

@@ -182,7 +182,6 @@ class EncodedFrames:
         return self.pixels().astype(dtype or np.uint8, copy=False)
 
     def __getitem__(self, chosen: Any) -> Any:
-        """Return one decoded image for an integer, else the selected images as `EncodedFrames`."""
         if isinstance(chosen, int | np.integer):
             return self._decode(int(chosen))
         rows = chosen if isinstance(chosen, slice) else np.asarray(chosen)

@@ -121,7 +121,6 @@ class Source:
         return [str(name) for name in names]
 
     def path(self, episode: Row, columns: str, form: str) -> Path:
-        """Return a data or video file of an episode. `columns` is the start of the two columns that number the file."""
         indices = {f"{x}_index": int(episode[f"{columns}/{x}_index"]) for x in ("chunk", "file")}
         return self.folder / form.format(video_key=self.key, **indices)
 
