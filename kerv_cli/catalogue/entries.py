@@ -145,11 +145,6 @@ def find_runs(database: Database) -> list[RunEntry]:
 
 
 def _with_command(entry: RunEntry, row: RunRow, is_finished: bool) -> RunEntry:
-    """Return an entry with the state, progress and message of the newest command that makes it.
-
-    Args:
-        is_finished: Whether the same command has finished before. Then a failed repetition keeps the artifact complete.
-    """
     entry, is_running = replace(entry, command=row.command), row.status == RUNNING
     is_repeat = is_finished and entry.state == COMPLETE
     if not entry.has_episodes and (row.status == COMPLETE or (is_repeat and not is_running)):

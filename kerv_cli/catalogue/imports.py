@@ -152,7 +152,6 @@ def _stored_episodes(connection: sa.Connection, path: Path, settings: dict[int, 
 
 
 def _add(study: Study, episodes: Iterable[ImportedEpisode], command: Sequence[str]) -> None:
-    """Write a study, and its episodes that were run elsewhere, in one transaction."""
     from kerv_cli.lab.study import Plan, save_in  # imports torch
 
     with Run(study.database, study.kind, study.name, command) as record, study.database.writing() as connection:

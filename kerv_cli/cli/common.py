@@ -137,7 +137,6 @@ def _parse_error(error: Any, words: Sequence[str]) -> str:
 
 
 def results_word(overrides: Iterable[str]) -> str:
-    """Return the typed ` results=DIR` and ` store=URL`, to append to a suggested command. Empty without both."""
     return "".join(f" {quoted(word)}" for word in overrides if word.startswith(("results=", "store=")))
 
 

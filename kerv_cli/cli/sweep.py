@@ -91,7 +91,6 @@ def sweep(overrides: list[str], cfg: Cfg = False, show_plan: ShowPlan = False, a
 
 @contextlib.contextmanager
 def _first_commands(resolved: ResolvedStudy, overrides: list[str]) -> Iterator[None]:
-    """Add to an error that the study's file lists commands to run before it, if it does."""
     try:
         yield
     except KervError as error:
