@@ -102,7 +102,7 @@ def _differing(new: Mapping[str, Any], old: Mapping[str, Any]) -> list[str]:
 
 
 def hash_of(value: object) -> str:
-    """Return a short hash of a JSON value: the first 16 hexadecimal digits of the SHA-256 of its canonical JSON text."""
+    """Return a short hash of a JSON value: 16 hexadecimal digits of the SHA-256 of its canonical text."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     return hashlib.sha256(text.encode("ascii")).hexdigest()[:16]
 
