@@ -17,6 +17,7 @@ from command import refusal, told
 from conftest import refused, until
 from examples.point_mass import SPEC as POINT
 from examples.point_mass import PointWorld
+from test_board import client_of
 from websockets.sync.server import serve
 
 import kerv_cli as library
@@ -180,6 +181,9 @@ def test_two_servers_are_two_settings_that_take_turns_and_both_times_are_in_the_
     assert table["unverified_share"].isna().all()
     assert table.loc["real", "felt_latency_ms"] > 0
     assert "of it the" in " ".join(told("report", "study=two", f"results={tmp_path}", "--all").split())
+    board = client_of(tmp_path)
+    first = re.findall(r"/episodes/\d+", board.get("/studies/two/episodes").text)[0]
+    assert "policy&#39;s server" in board.get(first).text
 
 
 def once(wrong: Any):

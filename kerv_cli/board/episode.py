@@ -13,7 +13,7 @@ import subprocess
 import time
 import urllib.request
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from operator import attrgetter
 from typing import Any
 from urllib.error import URLError
@@ -79,13 +79,19 @@ def show_episode(request: Request) -> Response:
         is_coded=names is not dofs,
         counts=counts,
         styles=OUTCOMES,
-        phases={phase: row[f"seconds.{phase}"] for phase in PHASES if row[f"seconds.{phase}"]},
+        phases=_phases(row),
         others=[one for one in outcomes(found.store, episode.task, episode.seed) if one.episode is not None],
         command=command,
         why_not=why_not,
         chosen=chosen,
         **_film_values(request, found, steps[chosen] if steps else 0, decodes),
     )
+
+
+def _phases(row: Mapping[str, Any]) -> dict[str, float]:
+    if served := row["server_seconds"]:
+        return {"policy's server": served, "the way to it and back": row["seconds"] - served}
+    return {phase: row[f"seconds.{phase}"] for phase in PHASES if row[f"seconds.{phase}"]}
 
 
 def _film_values(

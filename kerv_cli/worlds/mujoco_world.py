@@ -105,7 +105,10 @@ def find_backend() -> tuple[str, str]:
     if not backend:
         if "mujoco.gl_context" in sys.modules:
             return "", "mujoco was imported before a GL backend was chosen: set MUJOCO_GL=egl"
-        backend = next(filter(_draws, _HEADLESS), "")
+        try:
+            backend = next(filter(_draws, _HEADLESS), "")
+        except subprocess.TimeoutExpired:
+            return "", f"OpenGL drew nothing within {_PROBE_SECONDS:.0f} s, the machine may be busy: set MUJOCO_GL=egl"
         if not backend:
             return "", f"no OpenGL backend can draw here: {_INSTALL}"
         os.environ["MUJOCO_GL"] = backend
@@ -118,7 +121,7 @@ def _draws(backend: str) -> bool:
     # in its own process, so that a broken driver cannot crash kerv
     environment = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
     command = [sys.executable, "-c", _PROBE]
-    with contextlib.suppress(subprocess.SubprocessError):
+    with contextlib.suppress(subprocess.CalledProcessError):
         subprocess.run(command, env=environment, capture_output=True, timeout=_PROBE_SECONDS, check=True)
         return True
     return False
