@@ -13,7 +13,7 @@ from command import kerv, refusal, told
 from kerv_cli.bench.estimate import DRAFTS, LOOP, Draft, break_even, language_of, shape_of
 from kerv_cli.bench.physics import DEVICES, ENGINES, SHAPES, Sizes, priced
 from kerv_cli.engine.record import DecodeRecord, Round
-from kerv_cli.episodes.cost import prices, read_profile, work_of_record
+from kerv_cli.episodes.cost import Profile, prices, read_profile, work_of_record
 
 ROOT = Path(__file__).resolve().parent.parent
 OPENVLA = priced(SHAPES["openvla-7b"], DEVICES["a100"], ENGINES["eager"])
@@ -30,13 +30,36 @@ def drafts(*words: str, engine: int = 0) -> dict[str, dict]:
     return {one["method"]: one for one in machine(*words)["engines"][engine]["drafts"]}
 
 
-def taken(*rounds: Round, size: int = 7) -> float:
+def taken(*rounds: Round, size: int = 7, profile: Profile = OPENVLA) -> float:
     record = DecodeRecord(tuple(range(size)), None, len(rounds), rounds, "ar", 0.0, {"vision": 1.0}, size=size)
-    return prices(work_of_record(record), OPENVLA)[0]
+    return prices(work_of_record(record), profile)[0]
 
 
+PUBLIC = priced(SHAPES["openvla-7b"], DEVICES["a100"], ENGINES["public"])
 FIRST = Round("prefill", committed=1)
 SINGLE = [Round("decode", start=n, committed=1) for n in range(7)]
+
+
+@pytest.mark.parametrize(
+    ("rounds", "more"),
+    [
+        ([FIRST, *SINGLE[1:]], [("verify", 1)]),  # AR runs N + 1 forwards
+        (
+            [FIRST, *(Round("verify", "drafter", n, accepted=2, committed=3, tree_size=4) for n in (1, 4))],
+            [("draft", 4), ("verify", 5), ("feed", 3)],
+        ),
+        (
+            [FIRST, Round("verify", "drafter", 1, accepted=5, committed=6, tree_size=49, levels=5)],
+            [("tree", 5), ("verify", 50), ("feed", 6)],
+        ),
+        ([Round("prefill", "early", 0, accepted=6, committed=7, tree_size=6)], []),
+        ([Round("skip", "retrieval", 0, accepted=0, committed=7, tree_size=7)], []),
+    ],
+)
+def test_the_papers_own_program_runs_a_round_too_many_and_pays_for_each_draft(rounds, more):
+    drafts = sum(one.proposer == "drafter" for one in rounds)
+    extra = sum(PUBLIC.seconds(kind, rows) for kind, rows in more) + drafts * ENGINES["public"].draft
+    assert taken(*rounds, profile=PUBLIC) == pytest.approx(taken(*rounds) + extra)
 
 
 @pytest.mark.parametrize(

@@ -115,7 +115,7 @@ def estimate(settings: EstimateSettings) -> Iterator[dict[str, Any]]:
     else:
         shape, assumed = shape_of(settings.weights)
         for device in map(DEVICES.__getitem__, dict.fromkeys(settings.device)):
-            for engine in ENGINES.values():
+            for engine in (ENGINES["tuned"], ENGINES["eager"]):
                 rows = {"encode": 1, "prefill": shape.prompt, "verify": 1}
                 bounds = {kind: engine.bound(shape.needs(kind, n), device) for kind, n in rows.items()}
                 costs = NamedProfile(engine.name, priced(shape, device, engine), bounds)

@@ -8,7 +8,7 @@ model) is slower. The constants here say by how much, and who measured it. This 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 from kerv_cli.targets.openvla.config import TOWERS, Language, Tower
@@ -84,6 +84,8 @@ class Engine:
         layer: Number of kernels per layer of the language model or of the drafter.
         block: Number of kernels per block of a vision encoder.
         system: Further seconds of each run of the target's encoder or trunk.
+        draft: Further seconds of each draft of the drafter.
+        extra_round: Whether each decode runs one forward, or one round of drafting and verifying, too many.
         source: Who measured these figures.
     """
 
@@ -94,6 +96,8 @@ class Engine:
     block: int
     system: float
     source: str
+    draft: float = 0.0
+    extra_round: bool = False
 
     def times(self, needs: Needs, device: Device) -> dict[str, float]:
         """Return the seconds of `reading`, `arithmetic`, `launches` and `system time` in a phase, by these names.
@@ -122,7 +126,8 @@ class Engine:
 # of an A100's 2,039 GB/s with Llama-2 7B, one sequence, in bfloat16.
 SHARE = 0.69
 
-# Engines by name. *tuned*: captured graphs and fused kernels. *eager*: the code that the papers measure.
+# Engines by name. *tuned*: captured graphs and fused kernels. *eager*: ordinary code around a plain loop. *public*: the
+# same kernels in the loop of Spec-VLA's repository, which KERV's and HeiSD's inherit.
 ENGINES = {
     "tuned": Engine(
         "tuned",
@@ -144,6 +149,14 @@ ENGINES = {
         "trunk takes 113 ms (A100, 7 forwards of 32 layers); HeiSD's 53 ms of system time, over encoder and 7 forwards",
     ),
 }
+ENGINES["public"] = replace(
+    ENGINES["eager"],
+    name="public",
+    draft=53e-3 / 8,
+    extra_round=True,
+    source=f"{ENGINES['eager'].source}, and once more for each draft (a fit); N + 1 forwards, or one more draft and "
+    "verification (Spec-VLA's repository: run_libero_goal_AR.py, and a loop until there are more than N tokens)",
+)
 # An ideal engine. Every phase takes exactly its floor, the shortest time that the device allows.
 ROOFLINE = Engine("roofline", 1.0, 0.0, 0, 0, 0.0, "the floor: the longer of reading and computing")
 
@@ -246,7 +259,7 @@ class Shape:
 
 def priced(shape: Shape, device: Device, engine: Engine) -> Profile:
     """Return a latency profile with the computed seconds of each phase, for chunks of up to `CHUNK` tokens."""
-    from kerv_cli.episodes.cost import Profile
+    from kerv_cli.episodes.cost import EXTRA_ROUND, Profile
 
     rows = {
         "encode": (1,),
@@ -259,8 +272,10 @@ def priced(shape: Shape, device: Device, engine: Engine) -> Profile:
     }
     phases = {}
     for kind, counts in rows.items():
-        phases[kind] = counts, tuple(engine.seconds(shape.needs(kind, n), device) for n in counts)
-    return Profile(shape.prompt, phases, CHUNK, {"target": shape.name, "device_name": device.title})
+        more = engine.draft * (kind in ("draft", "tree"))
+        phases[kind] = counts, tuple(engine.seconds(shape.needs(kind, n), device) + more for n in counts)
+    about = {"target": shape.name, "device_name": device.title, EXTRA_ROUND: engine.extra_round}
+    return Profile(shape.prompt, phases, CHUNK, about)
 
 
 def encoder_of(towers: Sequence[Tower], width: int) -> Needs:

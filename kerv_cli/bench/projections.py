@@ -8,7 +8,7 @@ from typing import Any
 
 from kerv_cli.bench.physics import DEVICES, ENGINES, ROOFLINE, SHAPES, Device, Engine, priced
 from kerv_cli.bench.settings import BenchSettings
-from kerv_cli.episodes.cost import Profile
+from kerv_cli.episodes.cost import EXTRA_ROUND, Profile
 
 ACTION = 7  # tokens of one action of OpenVLA. Published times are of one action.
 
@@ -87,6 +87,7 @@ class Projection:
             "from": f"{published}, {100 * engine.share:.0f} % of both; {engine.source}",
             "encoder_floor": float(f"{self.floors.seconds('encode', 1):.4g}"),
             "encoder_system": engine.system,
+            **({EXTRA_ROUND: True} if engine.extra_round else {}),
             "profile": profile,
         }
 

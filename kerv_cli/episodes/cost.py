@@ -31,6 +31,9 @@ READ_PHASES = ("vision", "propose", "accept", "rectify", "other")
 """Phases whose recorded seconds the cost model reads. For `vision`, it only reads whether the seconds are 0."""
 
 
+EXTRA_ROUND = "extra_round"
+"""Key of a profile of the papers' public code, which goes on until it has more than N tokens: one round too many."""
+
 Columns = Mapping[str, np.ndarray]
 """Arrays by name."""
 COUNTED = ("mode", "proposer", "start", "tree_size", "accepted", "levels")
@@ -91,7 +94,7 @@ class Profile:
 
     def decode(self, tokens: int) -> float:
         first = self.seconds("encode", 1) + self.seconds("prefill", self.prompt)
-        return first + (tokens - 1) * self.seconds("verify", 1)
+        return first + (tokens - 1 + bool(self.about.get(EXTRA_ROUND))) * self.seconds("verify", 1)
 
     def as_dict(self) -> dict[str, Any]:
         phases = {kind: {"rows": list(rows), "seconds": list(seconds)} for kind, (rows, seconds) in self.phases.items()}
@@ -144,12 +147,15 @@ class Work:
             the decode used a proposer with this kind of cost.
         host: (decodes,) recorded seconds that neither depend on the target's size nor were spent on drafting.
         propose: (decodes,) recorded seconds of drafting. 0 if the drafter drafted, because `calls` holds its drafts.
+        again: Each decode's first verification after its prefill, with its draft: the round that the papers' public
+            code runs once more at the end (`EXTRA_ROUND`).
     """
 
     calls: Mapping[str, Calls]
     sources: Columns
     host: np.ndarray
     propose: np.ndarray
+    again: Mapping[str, Calls]
 
     @property
     def needs(self) -> list[str]:
@@ -182,14 +188,23 @@ def work_of(rounds: Columns, counts: np.ndarray, phases: Columns, looked_up: np.
     def calls(chosen: np.ndarray, rows: np.ndarray, with_prompt: np.ndarray | bool = False) -> Calls:
         return Calls(decode[chosen], rows[chosen], np.broadcast_to(with_prompt, rows.shape)[chosen])
 
+    def rounds_of(chosen: np.ndarray) -> dict[str, Calls]:
+        drafted, drawn = chosen & drafts & ~trees, chosen & trees
+        return {
+            "verify": calls(chosen & forward & ~prefill, 1 + nodes),
+            DRAFTING: calls(drafted, nodes),
+            "tree": calls(drawn, np.minimum(levels, size - start - 1)),
+        }
+
+    verifies = np.flatnonzero(forward & ~prefill)
+    first = np.zeros(len(decode), bool)
+    first[verifies[np.unique(decode[verifies], return_index=True)[1]]] = True
     encoded = np.flatnonzero(phases["vision"])
     found = {
         "encode": Calls(encoded, np.ones(len(encoded), int), np.zeros(len(encoded), bool)),
         "prefill": calls(forward & prefill, nodes, True),
-        "verify": calls(forward & ~prefill, 1 + nodes),
         "feed": calls(feeds, accepted + ~prefill, prefill),
-        DRAFTING: calls(drafts & ~trees, nodes),
-        "tree": calls(trees, np.minimum(levels, size - start - 1)),
+        **rounds_of(np.ones(len(decode), bool)),
     }
     sources: dict[str, np.ndarray] = {}
     for kind, names in costs.items():
@@ -201,6 +216,7 @@ def work_of(rounds: Columns, counts: np.ndarray, phases: Columns, looked_up: np.
         sources={kind: drafted for kind, drafted in sources.items() if drafted.any()},
         host=phases["accept"] + phases["rectify"] + phases["other"],
         propose=np.where(has_drafter, 0.0, phases["propose"]),
+        again={**rounds_of(first), "feed": calls(first & has_drafter[decode], accepted + 1)},
     )
 
 
@@ -218,7 +234,8 @@ def prices(work: Work, profile: Profile) -> np.ndarray:
     drafts, if it has their times. Everything else keeps its recorded seconds.
     """
     total = np.array(work.host, dtype=float)
-    for kind, (decode, rows, with_prompt) in work.calls.items():
+    again = work.again.items() if profile.about.get(EXTRA_ROUND) else ()
+    for kind, (decode, rows, with_prompt) in (*work.calls.items(), *again):
         known = DRAFTING if kind == "tree" and profile.lacks([kind]) else kind
         total += np.bincount(decode, profile.times(known, rows + with_prompt * profile.prompt), len(total))
     drafting = np.zeros(len(total))
