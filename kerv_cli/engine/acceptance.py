@@ -6,6 +6,7 @@ the smaller summed distance to the target tokens, then to the path that was prop
 
 from __future__ import annotations
 
+import functools
 import itertools
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -54,11 +55,11 @@ def accept_by_group(
     alive = [False] * len(tree)  # whether no limit is broken on the path to this node
     in_group = [0] * len(tree)  # distances summed within the node's group
     distances = [0] * len(tree)  # distances summed along the path
-    best, best_length, best_distance = ROOT, 0, 0
+    best, best_length, best_distance, dofs = ROOT, 0, 0, len(limits)
     for i, (token, parent, depth) in enumerate(zip(tree.tokens, tree.parents, tree.depths, strict=True)):
         if parent != ROOT and not alive[parent]:
             continue
-        dof = (start + depth) % len(limits)
+        dof = (start + depth) % dofs
         first, end = bounds[dof]
         distance = abs(token - target_tokens[parent + 1])
         in_group[i] = distance if parent == ROOT or dof == first else distance + in_group[parent]
@@ -92,7 +93,11 @@ class DistanceRule(Buildable):
 
     def same_limits(self, r: int, strict: bool = True) -> tuple[int, ...]:
         """Return the limit r for each of the D DoFs, in bins. With `strict`, strict DoFs (such as a gripper) get 0."""
-        return tuple(r * (not (strict and one)) for one in self.space.strict_tokens(self.space.kinds))
+        return tuple([0 if one else r for one in self._strict]) if strict else (r,) * self.space.kinds
+
+    @functools.cached_property
+    def _strict(self) -> list[bool]:
+        return self.space.strict_tokens(self.space.kinds).tolist()
 
     @abstractmethod
     def limits(self, r: int) -> tuple[int, ...]:

@@ -16,7 +16,7 @@ import numpy as np
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.decisions import ROOT, Choice, Judged, Rectified, SkipDecision
-from kerv_cli.engine.record import PARALLEL, DecodeRecord, Round, variability
+from kerv_cli.engine.record import PARALLEL, DecodeRecord, Round
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -153,7 +153,7 @@ class Chunk:
     def dofs(self) -> int:
         return self.space.dofs
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Number of tokens N in the complete chunk. With an end token, N is the largest possible number."""
         longest = self.space.longest(self.steps)
@@ -254,7 +254,9 @@ class Chunk:
         values.flat[list(self.filled)] = list(self.filled.values())
         return values
 
-    def record(self, actions: np.ndarray, seconds: float, phases: dict[str, float]) -> DecodeRecord:
+    def record(
+        self, actions: np.ndarray, differs: float | None, seconds: float, phases: dict[str, float]
+    ) -> DecodeRecord:
         return DecodeRecord(
             tokens=tuple(self.tokens),
             actions=actions,
@@ -266,7 +268,7 @@ class Chunk:
             phases=phases,
             compensated=self.compensated,
             filled=tuple(self.filled),
-            variability=variability(self.rounds, self.space),
+            variability=differs,
             skipped=any(one.mode == "skip" for one in self.rounds),
             similarity=self.similarity,
             metric=self.choice.metric if self.choice is not None else None,

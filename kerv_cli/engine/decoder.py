@@ -25,7 +25,7 @@ from kerv_cli.engine.draft import EMPTY, Draft, read, upload
 from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import Cache, ContinuesGreedily, EncodesMany, PredictsTokens, Target
-from kerv_cli.engine.record import PHASES, UNTIMED, DecodeRecord, Round, variability
+from kerv_cli.engine.record import MEAN, PHASES, UNTIMED, DecodeRecord, Round, variability
 
 
 class Stopwatch:
@@ -148,10 +148,11 @@ class Decoder(Follower):
         chunk = self.decode_prompt(encode, stopwatch)
         actions = chunk.actions()
         self.last, self.planned = chunk.tokens, [*chunk.values(self.target.chunk)]
-        self.threshold.update(variability(chunk.rounds, self.space, self.threshold.measure))
+        differs, measure = variability(chunk.rounds, self.space), self.threshold.measure
+        self.threshold.update(differs if measure == MEAN else variability(chunk.rounds, self.space, measure))
         if self.parts.rectifier is not None:
             self.parts.rectifier.next_decode()
-        record = chunk.record(actions, stopwatch.stop(), stopwatch.phases)
+        record = chunk.record(actions, differs, stopwatch.stop(), stopwatch.phases)
         self.decodes += 1
         if not self.deviation_every or self.decodes % self.deviation_every:
             return record
@@ -381,7 +382,10 @@ class BatchDecoder:
                     chunk.commit_token(token)
         for chunk in chunks:
             chunk.episode.last = chunk.tokens
-        return [chunk.record(chunk.actions(), math.nan, dict(UNTIMED)) for chunk in chunks]
+        return [
+            chunk.record(chunk.actions(), variability(chunk.rounds, self.target.actions), math.nan, dict(UNTIMED))
+            for chunk in chunks
+        ]
 
     def _encode(self, observations: Sequence[Observation]) -> list[Tensor]:
         # on a CPU one by one, because kerv's compiled encoders are faster that way; each is (1, P, E)

@@ -111,7 +111,8 @@ class Draft:
         seen, size = self.ancestors, before + len(self)
         if seen is None:
             return None
-        mask: Any = np.tri(size, dtype=bool)
+        places = np.arange(size)
+        mask: Any = places[:, None] >= places
         if isinstance(seen, Tensor):
             mask = torch.ones(size, size, dtype=torch.bool, device=seen.device).tril_()
         mask[before:, before:] = seen

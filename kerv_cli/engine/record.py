@@ -166,16 +166,20 @@ def variability(rounds: Sequence[Round], space: ActionSpace, measure: str = MEAN
     """
     if space.code is not None:
         return None
-    differences: list[float] = []
+    drafted, targets, places = list[int](), list[int](), list[int]()
     for one in rounds:
         count = one.accepted if measure.endswith("accepted") else len(one.drafted)
-        if count and one.mode != "skip":
-            drafted, targets = space.values_of(np.array((one.drafted[:count], one.target_tokens[:count])))
-            moving = ~space.strict_tokens(one.start + count)[one.start :]
-            differences += np.abs(drafted - targets)[moving].tolist()
-    if not differences:
+        if one.mode != "skip":
+            drafted += one.drafted[:count]
+            targets += one.target_tokens[:count]
+            places += range(one.start, one.start + count)
+    if not places:
         return None
-    return float(np.sum(differences) if measure.startswith("sum") else np.mean(differences))
+    first, second = space.centres[[drafted, targets]]
+    differences = np.abs(first - second)[~space.is_strict[np.array(places) % space.dofs]]
+    if not len(differences):
+        return None
+    return float(differences.sum() if measure.startswith("sum") else differences.mean())
 
 
 def path_length(points: np.ndarray) -> float:
