@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -173,7 +174,8 @@ def test_two_servers_are_two_settings_that_take_turns_and_both_times_are_in_the_
             assert "9 reused" in told(*command, "--plan")
             (tmp_path / "two.yaml").write_text(text.replace("policy.name=slow", "policy.name=slower"))
             assert "3 episodes to run, 6 reused" in told(*command, "--plan")
-        told("rollout", "-m", *words(f"{first},{second}", tmp_path))
+        line = f"remote url={first}"  # without a name, the address is the label
+        assert line in told("rollout", "-m", *words(f"{first},{second}", tmp_path))
     table = library.load_study("two", tmp_path).to_pandas().set_index("label")
     assert table.loc["fast", "speedup_low"] > 1
     assert table.loc[["slow", "fast"], "success"].tolist() == [1, 1]
@@ -233,6 +235,43 @@ def test_a_server_that_comes_back_is_found_again_and_one_that_does_not_ends_its_
     assert output.count("failed:") == 2
     assert output.count("success,") == 2
     assert "cannot be reached (Connection refused)" in output
+
+
+OPENVLA = """
+import numpy as np
+from kerv_cli.base.wire import packed, unpacked
+from websockets.sync.server import serve
+
+def talk(connection):
+    connection.send(packed({}))
+    for frame in connection:
+        seen = unpacked(frame)
+        image = seen.pop("observation/image")
+        assert (image.shape, image.dtype, seen) == ((224, 224, 3), np.uint8, {"prompt": "pick up the bowl"})
+        connection.send(packed({"actions": [[0.1] * 6 + [float(image[:, :112].mean() > image[:, 112:].mean())]] * 2}))
+
+server = serve(talk, "127.0.0.1", 0)
+print(server.socket.getsockname()[1], flush=True)
+server.serve_forever()
+"""
+"""OpenVLA behind a server, as `openvla_libero` asks it: it opens the gripper if the image's left half is brighter."""
+
+
+def test_openvlas_interface_asks_a_server_in_a_process_of_its_own(monkeypatch):
+    monkeypatch.setattr(remote, "RECONNECT_S", 1.0)
+    dark, bright = np.zeros((2, 256, 256, 3), np.uint8) + np.array([0, 200], np.uint8)[:, None, None, None]
+    with subprocess.Popen([sys.executable, "-c", OPENVLA], stdout=subprocess.PIPE, text=True) as process:
+        policy = PolicySettings(kind="remote", url=f"ws://127.0.0.1:{process.stdout.readline().strip()}")
+        decoder = RemoteDecoder(policy, read_interface("openvla_libero"), LIBERO)
+        decoder.reset("bowl-on-stove", 0, np.zeros(3))
+        for halves, gripper in (((bright, dark), 1.0), ((dark, bright), -1.0)):  # the server's image is mirrored
+            image = np.concatenate([one[:, :128] for one in halves], 1)
+            seen = Observation(np.zeros(len(LIBERO.observation.proprioception)), np.zeros(0), "pick up the bowl")
+            record = decoder.decode(replace(seen, images={"agentview": image}))
+            np.testing.assert_allclose(record.actions, [[0.1] * 6 + [gripper]], rtol=1e-6)
+        process.kill()
+        with refused("cannot be reached (Connection refused): start the server there, for 1 s", error=EpisodeError):
+            decoder.decode(replace(seen, images={"agentview": image}))
 
 
 @pytest.mark.parametrize(("away", "failed"), [(3, 0), (1000, 2)])

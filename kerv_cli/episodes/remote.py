@@ -49,12 +49,12 @@ class Server:
     """A policy's server, and this process's connection to it.
 
     Attributes:
-        metadata: What the server said when it was first reached.
+        metadata: What the server said when it was first reached, which may be nothing. None before.
     """
 
     def __init__(self, url: str) -> None:
         self.url = url
-        self.metadata: Message = {}
+        self.metadata: Message | None = None
         self._stack = contextlib.ExitStack()
         self._connection: Any = None
         self._given_up = False
@@ -90,7 +90,7 @@ class Server:
         if isinstance(first, str):
             raise Lost(f"{self.url} sent a text frame before its metadata: {_last_line(first)}")
         metadata = _decoded(self.url, first)
-        self.metadata = self.metadata or metadata
+        self.metadata = metadata if self.metadata is None else self.metadata
         self._counted, self._given_up = (0, 0), False
         return metadata
 
@@ -101,7 +101,7 @@ class Server:
     def find(self, since: float) -> None:
         """Connect, and try again until RECONNECT_S after `since` (of time.monotonic) if the server was there before."""
         try:
-            metadata = self.reached(since, RECONNECT_S if self.metadata else 0.0)
+            metadata = self.reached(since, 0.0 if self.metadata is None else RECONNECT_S)
         except Lost as error:
             raise EpisodeError(str(error)) from error
         if metadata != self.metadata:
@@ -237,9 +237,8 @@ class RemoteDecoder(Follower):
 
     def __init__(self, policy: PolicySettings, interface: Interface, spec: EnvironmentSpec) -> None:
         self.server, self.spec = server_at(policy.url), spec
-        if not self.server.metadata:
-            self.server.connect()
-        self.interface = interface.adapted(self.server.metadata, policy.execute)
+        known = self.server.metadata
+        self.interface = interface.adapted(self.server.connect() if known is None else known, policy.execute)
         super().__init__(spec.actions, self.interface.cameras)
         self._begins, self._asks = True, WARM_UP
         self._sent = self._done = 0  # actions of the last answer, and those that were executed since

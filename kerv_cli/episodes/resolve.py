@@ -64,7 +64,7 @@ class Point:
     def label(self) -> str:
         words = [self.name]
         for key, value in self.varies.items():
-            words.append(f"{key.rpartition('.')[2]}={value}")
+            words.append(re.sub(r"\\(.)", r"\1", f"{key.rpartition('.')[2]}={value}"))  # Hydra writes ws\://HOST
         return check_label(" ".join(words))
 
 
