@@ -1,9 +1,8 @@
-"""Import studies from other databases, and export a study to a new one."""
+"""Import studies from other databases."""
 
 from __future__ import annotations
 
 import contextlib
-import os
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,11 +14,10 @@ import pyarrow as pa
 import sqlalchemy as sa
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.files import regular, write_folder
 from kerv_cli.episodes.identity import Setting
 from kerv_cli.episodes.rows import DECODE_SCHEMA, seconds_blob, table_blob
 from kerv_cli.lab import database as tables
-from kerv_cli.lab.database import FILE, MEASURES, SCHEMA, Database, file_url, measures_in, other_schema
+from kerv_cli.lab.database import FILE, MEASURES, SCHEMA, Database, measures_in, other_schema
 from kerv_cli.lab.plan import Episode
 from kerv_cli.lab.runs import Run
 from kerv_cli.lab.store import Study, planned_episodes, stored_settings, write_episode
@@ -30,11 +28,6 @@ _DAMAGE = (sa.exc.SQLAlchemyError, sqlite3.Error, pa.ArrowException, OSError, Va
 _BLOCK = ("about", "run", "seeds")
 _FURTHER = ("order", "started")
 _ROW = (*map(attrgetter("name"), MEASURES), *_FURTHER)
-
-# Instructions that SQLite may execute per connection (about 1 s), plus STEPS_PER_BYTE for each byte of the file
-MOST_STEPS = 20_000_000
-STEPS_PER_BYTE = 20
-_EVERY = 10_000
 
 
 @dataclass(frozen=True)
@@ -85,31 +78,15 @@ def database_in(path: Path) -> Path:
     return file
 
 
-def connect_foreign(path: Path) -> sqlite3.Connection:
-    """Open a SQLite file from somebody else, read-only.
-
-    A small file can contain an endless query. So a connection may execute only a number of instructions that grows with
-    the file's size. Then its queries fail.
-    """
-    size = regular(path).stat().st_size
+def _connect(path: Path) -> sqlite3.Connection:
+    # read-only; if its writer was killed, the last rows are in the log, which immutable=1 would ignore
     log = path.with_name(f"{path.name}-wal")
-    # if its writer was killed, the last rows are in the log, which a connection with immutable=1 would ignore
     immutable = "" if log.is_file() and log.stat().st_size else "&immutable=1"
-    connection = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro{immutable}", uri=True, check_same_thread=False)
-    ticks = iter(range((MOST_STEPS + STEPS_PER_BYTE * size) // _EVERY))
-    connection.set_progress_handler(lambda: next(ticks, None) is None, _EVERY)
-    try:
-        pages = connection.execute("PRAGMA page_count").fetchone()[0]
-        if immutable and size < pages * connection.execute("PRAGMA page_size").fetchone()[0]:
-            raise ValueError(f"only {size} bytes are there")
-    except BaseException:
-        connection.close()
-        raise
-    return connection
+    return sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro{immutable}", uri=True, check_same_thread=False)
 
 
 def _in_database(path: Path, database: Database, name: str, stack: contextlib.ExitStack) -> list[Found]:
-    engine = sa.create_engine("sqlite://", creator=lambda: connect_foreign(path), poolclass=sa.pool.NullPool)
+    engine = sa.create_engine("sqlite://", creator=lambda: _connect(path), poolclass=sa.pool.NullPool)
     with _damage(path):
         connection = stack.enter_context(engine.connect())
         about = tables.ABOUT.c
@@ -173,21 +150,4 @@ def _damage(path: Path) -> Iterator[None]:
         yield
     except _DAMAGE as error:
         why = " ".join(str(getattr(error, "orig", error)).split())[:160]
-        raise CheckpointError(f"{path} is damaged, too large, or not a kerv.db: {why}") from error
-
-
-def export_database(study: Study, folder: Path) -> Path:
-    """Write a study into a new kerv.db in a folder. An existing kerv.db is replaced."""
-
-    def fill(new: Path) -> None:
-        copy = Database(new, file_url(new))
-        with study.database.reading() as connection:
-            row = connection.execute(sa.select(tables.STUDIES).where(tables.STUDIES.c.name == study.name)).one()
-            copied, episodes, command = _stored(connection, folder / FILE, row, copy)
-            _add(copied, episodes, command)
-        copy.close()
-
-    if folder.is_dir() and set(os.listdir(folder)) - {FILE}:
-        raise UsageError(f"{folder} holds other files: choose another folder with --dir")
-    write_folder(folder, fill)
-    return folder / FILE
+        raise CheckpointError(f"{path} is damaged, or not a kerv.db: {why}") from error

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask; names must be whole.")]
-To = Annotated[str, typer.Option("--to", help="csv, parquet or db.")]
+To = Annotated[str, typer.Option("--to", help="csv or parquet.")]
 Folder = Annotated[Path | None, typer.Option("--dir", help="Folder to write to; default results/exports/FORMAT.")]
 
 
@@ -265,7 +265,7 @@ def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
 def export(
     settings: CommandSettings, names: list[str], to: To = "csv", folder: Folder = None, as_json: AsJson = False
 ) -> None:
-    """Write the episodes of a run as CSV, Parquet, or a database that 'kerv runs import' reads.
+    """Write the episodes of a run as CSV or Parquet.
 
     NAME: runs (id, a unique part of it, or last) and results=DIR.
 

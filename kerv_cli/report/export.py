@@ -1,4 +1,4 @@
-"""Export the episodes of a run as CSV, Parquet or a database of their own."""
+"""Export the episodes of a run as CSV or Parquet."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ import pandas as pd
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.files import atomic_path, write_text
 from kerv_cli.catalogue.entries import RunEntry, store_of
-from kerv_cli.catalogue.imports import export_database
 from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.store import Study
 
-FORMATS = ("csv", "parquet", "db")
+FORMATS = ("csv", "parquet")
 _AT_ONCE = 100  # episodes in memory at a time
 
 
@@ -22,8 +21,6 @@ def export(run: RunEntry, database: Database, to: str, folder: Path) -> list[Pat
     if to not in FORMATS:
         raise UnknownName("format", to, FORMATS)
     store = store_of(run, database)
-    if to == "db":
-        return [export_database(store, folder / run.id)]
     episodes = store.frame()
     if episodes.empty:
         raise UsageError(f"study '{store.name}' has no episode yet: {store.how_to_run()}")
