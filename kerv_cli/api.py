@@ -159,7 +159,7 @@ def runs(results: str | Path = "results", store: str = "", **filters: str) -> pd
         results: Folder that kerv writes to.
         store: URL of the database, as for `load_study`.
         **filters: Conditions that runs must meet: `kind`, `method`, `task` (a name, or a pattern such as `drawer*`),
-            `state`, `since` (time in ISO 8601, UTC).
+            `state`.
 
     Raises:
         UsageError: There is no such filter or kind.

@@ -339,7 +339,6 @@ ANSWERS = [
     ("rollout world.stress=push", "world.stress: Invalid type assigned"),
     ("rollout world.stress.level=9", "world.stress.level=9: from 0 to 4"),
     ("demos episodes=10 seed=100000", "seed 100000 is for evaluation; seeds for training are 0 to 49999"),
-    ("runs list since=yesterday", "since=yesterday is not a date: write 2026-11-23"),
     ("rollout method=spec_vla boundary.f_star=0.3", "unknown key 'boundary.f_star'"),
     ("rollout -m method=spec_vla,kerv threshold.r=5", "method=kerv: unknown key 'threshold.r'"),
     ("bench policy.target=mt10-vision", "unknown key 'policy.target': did you mean target?"),

@@ -18,7 +18,7 @@ import sqlalchemy as sa
 from command import kerv
 from studies_synthetic import swept, threshold_study
 
-from kerv_cli.catalogue.entries import find_runs, labels_in, matching
+from kerv_cli.catalogue.entries import find_runs
 from kerv_cli.lab.database import EPISODES, RUNS, WANTED, opened
 from kerv_cli.lab.runs import INTERRUPTED, Run
 from kerv_cli.lab.work import EpisodeRunner
@@ -96,22 +96,6 @@ def test_a_finished_training_stays_finished_while_it_is_repeated_and_after_that_
     assert training()["state"] == "interrupted"
 
 
-def test_labels_are_listed_shown_exported_and_removed(copy):
-    (name,), where = [run["id"] for run in listed(copy, "method=ar")], f"results={copy}"
-    works("runs", "label", name, "tag=paper,final", "note=figure 3, bottom", where)
-    assert [run["id"] for run in listed(copy, "tag=final")] == [name]
-    assert listed(copy, "tag=fin") == []
-    assert "figure 3, bottom" in works("runs", "show", name, where)
-    works("runs", "export", name, where)
-    exported = pd.read_csv(copy / f"exports/csv/{name}.csv")
-    assert (set(exported["tag"]), set(exported["note"])) == ({"paper,final"}, {"figure 3, bottom"})
-    works("runs", "label", name, "tag=", where)
-    assert listed(copy, "method=ar")[0]["labels"] == {"note": "figure 3, bottom"}
-    assert f"'kerv runs label {name} tag=baseline" in kerv("runs", "label", name, where, code=2).stderr
-    works("runs", "rm", name, "--yes", where)
-    assert labels_in(opened(copy)) == {}
-
-
 def test_runs_are_listed_and_filtered(results):
     runs = listed(results)
     assert [run["kind"] for run in runs].count("rollout") == 2
@@ -124,7 +108,6 @@ def test_runs_are_listed_and_filtered(results):
     assert listed(results, "kind=target")[0]["id"] == "target/nano-state"
     assert listed(results, "task=push") == []
     assert "did you mean method" in kerv("runs", "list", "methd=ar", f"results={results}", code=2).stderr
-    assert matching(find_runs(opened(results)), {"since": "2999"}) == []
     assert "step, running, interrupted, failed, 2 of 6 episodes" in kerv("runs", "list", "state=x", code=2).stderr
 
 

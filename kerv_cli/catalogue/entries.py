@@ -6,15 +6,13 @@ import contextlib
 import csv
 import fnmatch
 import itertools
-import json
 import os
-import re
 import shlex
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from operator import attrgetter, itemgetter
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +25,7 @@ from kerv_cli.base.paths import shipped_dir
 from kerv_cli.base.registry import ArtifactPart
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.episodes.identity import OBSERVATION
-from kerv_cli.lab.database import ABOUT, EPISODES, SETTINGS, STUDIES, WANTED, Database
+from kerv_cli.lab.database import EPISODES, SETTINGS, STUDIES, WANTED, Database
 from kerv_cli.lab.plan import ALL, NEVER
 from kerv_cli.lab.runs import COMPLETE, RUNNING, RunRow, forget, interrupted, run_rows, time_left
 from kerv_cli.lab.store import ROLLOUT, SWEEP, Study
@@ -40,11 +38,7 @@ LOG, WEIGHTS = "log.csv", "model.safetensors"  # files of a training
 LAST = "last"
 _STUDIES = (SWEEP, ROLLOUT)
 _STATES = ("complete", "begun", "damaged", "step ", "running", "interrupted", "failed")
-# Labels that people give to a run: words, separated by commas, and free text
-LABELS = ("tag", "note")
-# In the table `about`, the row with the key `labels of ID` holds the labels of the run ID.
-_ABOUT = "labels of "
-_FILTERS = ("kind", "method", "task", "state", "since", "tag")
+_FILTERS = ("kind", "method", "task", "state")
 
 
 def artifact_kinds() -> tuple[str, ...]:
@@ -71,7 +65,6 @@ class RunEntry:
         made_from: Hashes of the artifacts that the entry was made from, by kind. If the settings of a study use several
             of one kind, the keys of the others are `drafter of LABEL`. `init`: the target whose weights a training
             started from.
-        labels: Texts that people wrote about the entry, with the keys `tag` and `note`.
     """
 
     id: str
@@ -90,11 +83,6 @@ class RunEntry:
     command: tuple[str, ...] = ()
     sha256: str = ""
     made_from: dict[str, str] = field(default_factory=dict)
-    labels: dict[str, str] = field(default_factory=dict)
-
-    @property
-    def tags(self) -> list[str]:
-        return list(filter(None, self.labels.get("tag", "").split(",")))
 
     @property
     def command_line(self) -> str:
@@ -138,9 +126,6 @@ def find_runs(database: Database) -> list[RunEntry]:
                 continue  # what the command made was removed
             entry = RunEntry(f"{kind}/{name}", kind, folder / kind / name, "", "", (kind,))
         found[kind, name] = _with_command(entry, row, (kind, name, row.command) in finished)
-    labels = labels_in(database)
-    for key, run in found.items():
-        found[key] = replace(run, labels=labels.get(run.id, {}))
     return sorted(found.values(), key=attrgetter("started", "id"), reverse=True)
 
 
@@ -187,8 +172,8 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
     """Return the entries that match every filter.
 
     Args:
-        filters: `kind` is the exact kind. `method`, `task` and `tag` are names, or patterns such as `drawer*`. `state`
-            is the beginning of a state, and `since` the earliest start time (ISO 8601).
+        filters: `kind` is the exact kind. `method` and `task` are names, or patterns such as `drawer*`. `state` is the
+            beginning of a state.
     """
     for key in filters:
         if key not in _FILTERS:
@@ -196,20 +181,16 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
     kinds = (*_STUDIES, *artifact_kinds())
     if filters.get("kind", SWEEP) not in kinds:
         raise UnknownName("kind of run", filters["kind"], kinds)
-    state, since, task = filters.get("state", ""), filters.get("since", ""), filters.get("task", "*")
+    state, task = filters.get("state", ""), filters.get("task", "*")
     if not any(one.startswith(state) or state.startswith(one) for one in _STATES) and not state[:1].isdigit():
         raise UnknownName("state", state, [*map(str.strip, _STATES), "2 of 6 episodes"])
-    if since and not re.fullmatch(r"\d{4}(-\d\d){0,2}(T.*)?", since):
-        raise UsageError(f"since={since} is not a date: write 2026-11-23 or 2026-11-23T14:00")
 
     def agrees(run: RunEntry) -> bool:
         return (
             run.kind == filters.get("kind", run.kind)
             and ("method" not in filters or bool(fnmatch.filter(run.methods, filters["method"])))
             and ("task" not in filters or f"{task}-v3" in run.tasks or bool(fnmatch.filter(run.tasks, task)))
-            and ("tag" not in filters or bool(fnmatch.filter(run.tags, filters["tag"])))
             and run.state.startswith(state)
-            and run.started >= since
         )
 
     return list(filter(agrees, runs))
@@ -346,22 +327,6 @@ def disk_bytes(folder: Path) -> int:
     return sum(map(os.path.getsize, filter(Path.is_file, folder.rglob("*"))))
 
 
-def labels_in(database: Database) -> dict[str, dict[str, str]]:
-    """Return the labels of each run that has labels, by the id of the run."""
-    rows = sa.select(ABOUT).where(ABOUT.c.key.startswith(_ABOUT))
-    with database.reading() as connection, database.checking("a label"):
-        return {row.key.removeprefix(_ABOUT): json.loads(row.value) for row in connection.execute(rows)}
-
-
-def set_labels(database: Database, run: str, labels: Mapping[str, str]) -> None:
-    kept = dict(filter(itemgetter(1), labels.items()))
-    with database.writing() as connection:
-        connection.execute(sa.delete(ABOUT).where(ABOUT.c.key == _ABOUT + run))
-        if kept:
-            text = json.dumps(kept, ensure_ascii=False)
-            connection.execute(sa.insert(ABOUT).values(key=_ABOUT + run, value=text))
-
-
 def check_removable(run: RunEntry) -> None:
     if run.folder.is_symlink():
         raise UsageError(f"{run.folder} is a link to {os.readlink(run.folder)}: remove the link, or what it points to")
@@ -378,7 +343,6 @@ def remove(run: RunEntry, database: Database) -> None:
     gone = set_aside(run.folder)
     if run.has_episodes:
         store_of(run, database).remove()
-    set_labels(database, run.id, {})
     forget(database, run.kind, run.id if run.has_episodes else run.id.removeprefix(f"{run.kind}/"))
     for folder in (gone, unfinished(run.folder)):
         shutil.rmtree(folder, ignore_errors=True)

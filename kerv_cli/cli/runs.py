@@ -49,7 +49,7 @@ def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a r
 def list_(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
     """List the runs of a results folder, the newest first.
 
-    NAME: kind=, method=, task=, state=, since=, tag= and results=DIR narrow the list.
+    NAME: kind=, method=, task=, state= and results=DIR narrow the list.
 
     Examples:
         kerv runs list
@@ -68,8 +68,8 @@ def list_(settings: CommandSettings, names: list[str], as_json: AsJson = False) 
     for run in runs:
         about = run.id, run.kind, run.started.replace("T", " ")[:16], run.state, few(run.methods), few(run.tasks)
         success = f"{run.figures['success']:.0%}" if "success" in run.figures else ""
-        rows.append((*about, run.episodes or "", success, ", ".join(run.tags)))
-    print_table(("run", "kind", "started, UTC", "state", "methods", "tasks", "episodes", "success", "tag"), rows)
+        rows.append((*about, run.episodes or "", success))
+    print_table(("run", "kind", "started, UTC", "state", "methods", "tasks", "episodes", "success"), rows)
 
 
 def _entry_row(run: RunEntry) -> dict[str, object]:
@@ -101,7 +101,7 @@ def show(settings: CommandSettings, names: list[str], as_json: AsJson = False) -
         content = {**_entry_row(run), "made_from": origin, "bytes": size}
         end_with_json({**content, "settings": [dict(row._mapping) for row in chosen]})
     lines = {"run": run.id, "kind": run.kind, "state": run.state, "started": run.started, "folder": run.folder}
-    lines |= {**run.labels, "size": f"{size / 1e6:.1f} MB"}
+    lines["size"] = f"{size / 1e6:.1f} MB"
     lines["command" if run.has_episodes else "made by"] = run.command_line or "unknown"
     if origin:
         lines["made from"] = ", ".join(map(" ".join, origin.items()))
@@ -127,36 +127,6 @@ def _total_row(row: Any) -> dict[str, object]:
         "forwards per step": f"{row.forwards / max(1, row.steps):.3g}",
         "ms per step": f"{1000 * row.seconds / row.steps:.3g}" if timed else None,
     }
-
-
-@command("runs label")
-def label(settings: CommandSettings, names: list[str]) -> None:
-    """Write tags and a note to a run. `kerv runs list tag=…`, the board and exports show them.
-
-    NAME: a run (id, a unique part of it, or last), tag= (several: tag=a,b), note= and results=DIR. An empty tag= or
-    note= removes what was written.
-
-    Examples:
-        kerv runs label last tag=baseline
-        kerv runs label main tag=paper,final note="figure 3"
-    """
-    from kerv_cli.catalogue.entries import LABELS, find_run, set_labels
-
-    changes: dict[str, str] = {}
-    others = []
-    for word in names:
-        kind, equals, text = word.partition("=")
-        if equals and kind in LABELS:
-            changes[kind] = text
-        else:
-            others.append(word)
-    (name,) = _run_names(others)
-    if not changes:
-        raise UsageError(f"write tag= or note=, as in 'kerv runs label {name} tag=baseline'")
-    database = database_of(settings)
-    run = find_run(database, name)
-    set_labels(database, run.id, run.labels | changes)
-    typer.echo(", ".join([run.id, *(f"{kind} {text}" for kind, text in (run.labels | changes).items() if text)]))
 
 
 @command("runs compare", writes=False)

@@ -25,9 +25,9 @@ def export(run: RunEntry, database: Database, to: str, folder: Path) -> list[Pat
     if episodes.empty:
         raise UsageError(f"study '{store.name}' has no episode yet: {store.how_to_run()}")
     if to == "parquet":
-        return _to_parquet(store, episodes.assign(**run.labels), folder / run.id)
+        return _to_parquet(store, episodes, folder / run.id)
     path = folder / f"{run.id}.csv"
-    shown = episodes.assign(**run.labels).drop(columns=["episode", "decode_seconds", "initial_state"])
+    shown = episodes.drop(columns=["episode", "decode_seconds", "initial_state"])
     write_text(path, shown.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
     return [path]
 
