@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import fnmatch
-import itertools
 import os
 import shlex
 import shutil
@@ -14,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import sqlalchemy as sa
 
@@ -23,15 +22,10 @@ from kerv_cli.base.files import clean, read_mapping, read_text, set_aside, sha25
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.paths import shipped_dir
 from kerv_cli.base.registry import ArtifactPart
-from kerv_cli.base.settings import CommandSettings
 from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.lab.database import EPISODES, SETTINGS, STUDIES, WANTED, Database
-from kerv_cli.lab.plan import ALL, NEVER
-from kerv_cli.lab.runs import COMPLETE, RUNNING, RunRow, forget, interrupted, run_rows, time_left
+from kerv_cli.lab.runs import COMPLETE, RUNNING, RunRow, forget, run_rows, time_left
 from kerv_cli.lab.store import ROLLOUT, SWEEP, Study
-
-if TYPE_CHECKING:
-    from kerv_cli.lab.study import Plan
 
 LOG, WEIGHTS = "log.csv", "model.safetensors"  # files of a training
 # Argument of commands that stands for the newest entry
@@ -346,26 +340,3 @@ def remove(run: RunEntry, database: Database) -> None:
     forget(database, run.kind, run.id if run.has_episodes else run.id.removeprefix(f"{run.kind}/"))
     for folder in (gone, unfinished(run.folder)):
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def plan_of(run: RunEntry, database: Database) -> Plan:
-    """Plan to run a sweep or rollout again, or the rest of an interrupted repetition."""
-    from kerv_cli.lab.study import new_name, plan_study  # imports torch, which listing runs does not need
-    from kerv_cli.lab.work import checked
-
-    results, study = str(database.results), store_of(run, database).load()
-    new = {setting.label: checked(setting, study.tasks, results) for setting in study.settings}
-    episodes = [replace(one, setting=new[one.setting.label]) for one in study.episodes]
-    study = replace(study, settings=tuple(new.values()), episodes=tuple(episodes))
-    # the same command resumes an interrupted repetition
-    command = ["runs", "rerun", run.id, *([] if results == CommandSettings().results else [f"results={results}"])]
-    row = interrupted(database, study.kind, command)
-    if row is not None:
-        name = row.name
-    elif study.kind == ROLLOUT:
-        name = new_name(study)
-    else:
-        numbers, name = itertools.count(2), f"{run.id}-again"
-        while Study(database, name).exists:
-            name = f"{run.id}-again{next(numbers)}"
-    return plan_study(replace(study, name=name), NEVER if row else ALL, command=command)

@@ -1,4 +1,4 @@
-"""`kerv runs`: list, show, compare, repeat, remove, export and import runs: sweeps, rollouts and trainings."""
+"""`kerv runs`: list, show, compare, remove, export and import runs: sweeps, rollouts and trainings."""
 
 from __future__ import annotations
 
@@ -10,18 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from kerv_cli.base.durations import count
-from kerv_cli.base.errors import Interrupted, KervError, UsageError
+from kerv_cli.base.errors import Interrupted, UsageError
 from kerv_cli.base.limits import setting
 from kerv_cli.base.paths import as_path
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
     AsJson,
-    ShowPlan,
     database_of,
     end_with_json,
-    end_with_plan,
     print_rows,
     print_table,
     results_word,
@@ -131,7 +128,7 @@ def _total_row(row: Any) -> dict[str, object]:
 
 @command("runs compare", writes=False)
 def compare_(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
-    """Compare two runs, ID or ID:SETTING: differences in settings, and in results with confidence intervals.
+    """Compare two runs, ID or ID:SETTING: their settings, results with confidence intervals, and tokens.
 
     NAME: runs (id, a unique part of it, or last) and results=DIR.
 
@@ -158,46 +155,10 @@ def compare_(settings: CommandSettings, names: list[str], as_json: AsJson = Fals
             interval = f"{row['low']:.3g} to {row['high']:.3g}" if is_number(row.get("low")) else ""
             rows.append({"measure": row["measure"], **numbers, "95 % interval": interval, "": row.get("what", "")})
         print_rows(rows)
+        if comparison["tokens"]:
+            typer.echo(comparison["tokens"])
         if comparison["note"]:
             typer.echo(comparison["note"])
-
-
-@command("runs rerun")
-def rerun(
-    settings: CommandSettings, names: list[str], overrides: list[str], plan: ShowPlan = False, as_json: AsJson = False
-) -> None:
-    """Repeat a sweep or rollout under a new name, and say whether the tokens are the same.
-
-    NAME: runs (id, a unique part of it, or last) and results=DIR.
-
-    Examples:
-        kerv runs rerun last
-        kerv runs rerun main --plan
-    """
-    from kerv_cli.catalogue.entries import find_run
-
-    database, (name,) = database_of(settings), _run_names(names)
-    run = find_run(database, name)
-    if run.kind not in ("sweep", "rollout"):
-        made = f", which '{run.command_line}' makes" if run.command else ""
-        raise UsageError(f"{run.id} is of the kind {run.kind}{made}: only sweeps and rollouts are repeated")
-    from kerv_cli.catalogue.entries import plan_of, store_of
-    from kerv_cli.cli.studies import run_plan
-    from kerv_cli.report.compare import same_tokens
-
-    planned = plan_of(run, database)
-    name = planned.study.name
-    if plan:
-        end_with_plan(f"{run.id} again as {name}: {count(len(planned.to_run), 'episode')}", as_json)
-    failed = run_plan(planned).failed
-    if failed:
-        raise KervError(failed[0].reason)
-    entry = find_run(database, name, exact=True)
-    same, shared = same_tokens(store_of(run, database), store_of(entry, database))
-    if as_json:
-        end_with_json({"run": entry.id, "folder": entry.folder, "episodes": shared, "same_tokens": same})
-    typer.echo(f"{entry.id}: the same tokens in {same} of {shared} episodes of {run.id}")
-    typer.echo(f"both side by side: kerv runs compare {run.id} {entry.id}{results_word(overrides)}")
 
 
 @command("runs rm")

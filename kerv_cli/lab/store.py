@@ -133,8 +133,9 @@ class Study:
             return connection.execute(sa.select(STUDIES).where(STUDIES.c.name == self.name)).first()
 
     def how_to_run(self) -> str:
-        """Return advice for error messages on how to run the study, such as: run `kerv sweep study=NAME`."""
-        return f"run `{self.sweep_command()}`" if self.kind == SWEEP else f"run `kerv runs rerun {self.name}`"
+        """Return advice for error messages, such as: run `kerv sweep study=NAME`."""
+        shown = f"`kerv runs show {self.name}` prints its command"
+        return f"run `{self.sweep_command()}`" if self.kind == SWEEP else shown
 
     def sweep_command(self, *overrides: str) -> str:
         """Return the newest command that ran the study as a sweep, or `kerv sweep study=NAME` if none is stored.

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import pandas as pd
 
+from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
 from kerv_cli.catalogue.entries import RunEntry, description_of, find_run, store_of
-from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, without
+from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Setting, without
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.plan import seeds_text
-from kerv_cli.lab.store import Study
 from kerv_cli.report.measures import Row, is_number, measure, paired
 from kerv_cli.report.statistics import Estimate
 from kerv_cli.report.summary import DIFFERENCE, SPEEDS
@@ -47,6 +47,11 @@ class ComparedRun:
     def episodes(self) -> pd.DataFrame:
         assert self.data is not None
         return self.data.episodes[self.data.episodes["label"] == self.label]
+
+    @property
+    def setting(self) -> Setting:
+        assert self.data is not None
+        return self.data.settings[self.label]
 
 
 def compared_runs(database: Database, name: str) -> list[ComparedRun]:
@@ -93,6 +98,7 @@ def compare(first: ComparedRun, second: ComparedRun) -> Row:
         - `first` and `second`: the two names
         - `settings`: every key whose two values differ, with both values. A missing value is None.
         - `results`: for each measure both values, the change, and the change's 95 % interval if it is known
+        - `tokens`: how many episodes have the same tokens. Empty if these may differ.
         - `note`: why there is no ratio of times. Empty if there is a ratio.
     """
     settings = differences(_settings_of(first), _settings_of(second))
@@ -104,7 +110,9 @@ def compare(first: ComparedRun, second: ComparedRun) -> Row:
         results = _episode_results(first.episodes, second.episodes)
         is_timed = any(row["measure"] in SPEEDS.values() for row in results)
     note = "" if is_timed else "no ratio of times: the two were not timed in turn, in one study"
-    return {"first": first.name, "second": second.name, "settings": settings, "results": results, "note": note}
+    tokens = _same_tokens(first, second)
+    names = {"first": first.name, "second": second.name}
+    return {**names, "settings": settings, "results": results, "tokens": tokens, "note": note}
 
 
 def _settings_of(side: ComparedRun) -> Row:
@@ -158,14 +166,19 @@ def _interval(change: Estimate, what: str) -> Row:
     return {"change": change.value, "low": change.low, "high": change.high, "what": what}
 
 
-def same_tokens(first: Study, second: Study) -> tuple[int, int]:
-    """Count the episodes (label, task, seed) that both studies have: those with equal tokens, and all."""
-    shared = _tokens(first).merge(_tokens(second), on=["label", "task", "seed"])
-    return int((shared["tokens_x"] == shared["tokens_y"]).sum()), len(shared)
+def _same_tokens(first: ComparedRun, second: ComparedRun) -> str:
+    # empty if the two are of other settings, weights or versions of kerv's rules, so that tokens may differ
+    if first.data is None or second.data is None or first.setting.work != second.setting.work:
+        return ""
+    both = _tokens(first).merge(_tokens(second), on=["task", "seed"])
+    return f"the same tokens in {(both['tokens_x'] == both['tokens_y']).sum()} of {count(len(both), 'episode')}"
 
 
-def _tokens(store: Study) -> pd.DataFrame:
-    frame = store.frame()[["episode", "label", "task", "seed"]]
-    decodes = store.decodes(frame["episode"].tolist(), ["tokens"]).to_pandas()  # `episode` is a position in the list
+def _tokens(side: ComparedRun) -> pd.DataFrame:
+    assert side.data is not None
+    frame = side.data.study.frame()
+    frame = frame[frame["label"] == side.label][["episode", "task", "seed"]].reset_index(drop=True)
+    # `episode` of the decodes is a position in the list
+    decodes = side.data.study.decodes(frame["episode"].tolist(), ["tokens"]).to_pandas()
     tokens = decodes.groupby("episode")["tokens"].agg(lambda rows: tuple(map(tuple, rows)))
     return frame.assign(tokens=tokens.reindex(range(len(frame))).to_list())
