@@ -63,13 +63,9 @@ def _parts_of(group: str) -> dict[str, Part]:
 
 
 def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
-    """Return the settings of a command.
+    """Return the settings of a command (its name with `_` instead of a space).
 
-    Args:
-        command: The command's name, with `_` instead of a space.
-        overrides: Arguments as typed: `method=kerv`, `threshold.r=5`, `task=[reach,push]`. Each key at most once.
-            `quick=true` adds the command's settings in `conf/quick.yaml`. Typed settings take precedence over these.
-        schema: Dataclass of the settings. Its defaults apply to settings that neither a file nor an override sets.
+    `quick=true` adds the command's settings in `conf/quick.yaml`. Typed settings take precedence over these.
     """
     from omegaconf import OmegaConf
     from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException, ValidationError
@@ -144,12 +140,7 @@ def _typed(overrides: Sequence[str], schema: type) -> dict[str, Any]:
 
 
 def preset_file(group: str, name: str) -> Path:
-    """Return the path of a method or study file.
-
-    Args:
-        group: `method` or `study`.
-        name: Name of a file in `conf/<group>` without its ending, or the path of any file that ends in .yaml or .yml.
-    """
+    """Return the path of a method or study file: a name in `conf/<group>`, or any path that ends in .yaml or .yml."""
     if name.endswith((".yaml", ".yml")):
         return Path(name).expanduser()
     path = conf_dir() / group / f"{name}.yaml"
@@ -159,17 +150,9 @@ def preset_file(group: str, name: str) -> Path:
 
 
 def _read_preset(group: str, name: str) -> tuple[dict[str, str], list[tuple[str, Any]], dict[str, str]]:
-    """Read a method or study file. The file maps keys to values, which overrides could set, too.
+    """Read a method or study file. In a method file, `proposer: drafter` chooses a part, all other keys set values.
 
-    In a method file, `proposer: drafter` chooses a part. All other keys set values, as in `threshold.r: 5`.
-
-    Args:
-        group: `method` or `study`. Empty if the command has no such file. Then all three results are empty.
-        name: As for `preset_file`.
-
-    Returns:
-        Three values. A map from each group to the part that the file chooses in it. The (key, value) pairs that the
-        file sets. A map from each key to its line in the file, written as `FILE:LINE: ` for error messages.
+    Return the chosen part by group, the (key, value) pairs, and the place `FILE:LINE: ` of each key for errors.
     """
     if not group:
         return {}, [], {}
@@ -216,15 +199,9 @@ def _parsed(override: str) -> Any:
 
 @functools.lru_cache(maxsize=256)
 def _composed(choices: tuple[tuple[str, str], ...], schema: type, conf: Path, artifacts: tuple[str, ...]) -> bytes:
-    """Return the settings of a command with these choices, as a pickled OmegaConf node.
+    """Return the settings with these choices, pickled: unpickling takes a fifth of the time of a deep copy.
 
-    Unpickling the settings takes a fifth of the time of a deep copy.
-
-    Args:
-        choices: (group, name) pairs, such as ("policy", "vision"). Later ones override earlier ones.
-        schema: Dataclass of the settings.
-        conf: Folder of the configuration files.
-        artifacts: Registered kinds of artifacts. The settings of a policy have a key for each of them.
+    Later (group, name) pairs override earlier ones. `artifacts` are the registered kinds, each a key of a policy.
     """
     from omegaconf import OmegaConf
 
@@ -290,11 +267,7 @@ def _keys(node: Any, prefix: str = "") -> Iterator[str]:
 
 
 def as_overrides(*overrides: str, **settings: object) -> list[str]:
-    """Turn keyword arguments into overrides as typed on the command line, and append them to `overrides`.
-
-    For example `episodes=3, task=["reach", "push"], threshold={"r": 5}` gives `episodes=3`, `task=[reach,push]`,
-    `threshold.r=5`.
-    """
+    """Append keyword arguments to overrides: `threshold={"r": 5}` gives `threshold.r=5`."""
     typed = list(overrides)
     for key, value in settings.items():
         if isinstance(value, Mapping):

@@ -21,12 +21,7 @@ def _unpickled(kind: type[KervError], message: str) -> KervError:
 
 
 class UsageError(KervError):
-    """The user asked for something impossible, such as an unknown name or a value out of range.
-
-    Args:
-        message: Error message, one line.
-        key: Name of the wrong setting, such as `threshold.r`. Empty if the message is not about a setting.
-    """
+    """The user asked for something impossible. `key` is the name of the wrong setting, if any."""
 
     exit_code = 2
     key = ""
@@ -40,14 +35,7 @@ _LISTED = 24  # names that a message lists
 
 
 class UnknownName(UsageError):
-    """A name does not exist. The message suggests similar names, or lists known names (24 at most).
-
-    Args:
-        kind: Kind of thing that is named, such as `task`, for the message.
-        name: The unknown name.
-        names: The known names.
-        remedy: Further text at the end of the message.
-    """
+    """A name does not exist. The message suggests similar names, or lists known names (24 at most), then a `remedy`."""
 
     def __init__(self, kind: str, name: str, names: Iterable[str], remedy: str = "") -> None:
         names = list(names)

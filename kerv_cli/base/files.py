@@ -45,11 +45,7 @@ _OF_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, err
 
 @contextlib.contextmanager
 def storage_errors(path: Path) -> Iterator[None]:
-    """Turn an OSError inside the `with` block into a StorageError, if the disk is full, broken or cannot be written.
-
-    Args:
-        path: The file or folder that is written, for the error message.
-    """
+    """Turn an OSError inside the block into a StorageError, if the disk is full, broken or cannot be written."""
     try:
         yield
     except OSError as error:
@@ -60,10 +56,6 @@ def storage_errors(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _temporary(path: Path) -> Iterator[Path]:
-    """Yield a new temporary path beside `path`. The `with` block writes there, and then renames the result to `path`.
-
-    The parent folder is created. After the block, anything left at the temporary path is removed.
-    """
     temporary = temporary_beside(path)
     try:
         with storage_errors(path):
@@ -90,13 +82,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def write_folder(folder: Path, fill: Callable[[Path], object]) -> None:
-    """Write a folder atomically: fill a temporary folder, then rename it. An existing folder is replaced.
+    """Write a folder atomically: `fill` a temporary folder, then rename it. An existing folder is replaced.
 
     If `fill` raises an exception, `folder` stays as it was.
-
-    Args:
-        folder: Path of the finished folder.
-        fill: Function that takes the temporary folder, and writes the content into it.
     """
     with _temporary(folder) as temporary:
         temporary.mkdir()
@@ -112,8 +100,7 @@ def write_folder(folder: Path, fill: Callable[[Path], object]) -> None:
 def set_aside(folder: Path) -> Path:
     """Rename a folder in one step, so that every command ignores it. Return the new, temporary path.
 
-    The caller then deletes the folder. If the process is killed before that, a later command deletes it. A missing
-    folder is no error.
+    The caller then deletes the folder. If the process is killed before that, a later command deletes it.
     """
     temporary = temporary_beside(folder)
     if folder.exists():
@@ -192,10 +179,7 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def write_if_changed(path: Path, content: bytes) -> None:
-    """Write a file atomically, unless it has this content already.
-
-    So the file's modification time says when its content changed.
-    """
+    """Write a file unless it has this content, so that its modification time says when the content changed."""
     if not path.is_file() or path.read_bytes() != content:
         write_bytes(path, content)
 
@@ -205,16 +189,14 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a value as indented JSON atomically. It raises the errors of `write_bytes`, too."""
+    """Write indented JSON atomically. NaN and infinity, which JSON cannot express, are a ValueError."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 def regular(path: Path, most: int = MOST_BYTES) -> Path:
-    """Return the path if it is a regular file of limited size. Use this before reading files of unknown origin.
+    """Return the path of a regular file of at most `most` bytes. Reading a pipe could wait forever.
 
-    Args:
-        path: The file.
-        most: Maximum size in bytes.
+    Anything else is an OSError, a larger file a ValueError.
     """
     status = os.stat(path)
     if not stat.S_ISREG(status.st_mode):
@@ -245,15 +227,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
 
 
 def read_yaml_lines(path: Path, what: str) -> tuple[dict[str, Any], dict[str, int]]:
-    """Read a YAML file that contains a mapping, and note the line of each key for error messages.
-
-    Args:
-        path: The file.
-        what: Name of the file in error messages.
-
-    Returns:
-        The mapping, and the line number of each key. Nested keys are joined by dots, such as `threshold.r`.
-    """
+    """Read a YAML file that contains a mapping. Return it, and the line of each key, such as `threshold.r`."""
     import yaml
 
     lines: dict[str, int] = {}
@@ -327,11 +301,7 @@ def is_left_over(path: Path) -> bool:
 
 
 def clean(folder: Path) -> list[Path]:
-    """Remove the temporary files and folders of ended processes from `folder`, not from its subfolders.
-
-    Returns:
-        The paths that the function tried to remove. A path still exists if removing it failed.
-    """
+    """Remove the temporary paths of ended processes from a folder, and return those that it tried to remove."""
     paths = [path for path in folder.glob(".*.tmp") if is_left_over(path)]
     for path in paths:
         remove(path)
@@ -352,14 +322,9 @@ def remove(path: Path) -> None:
 
 
 def is_alive(pid: int, seen: float) -> bool:
-    """Return whether a process of this machine, which was alive at the time `seen`, is still alive.
+    """Return whether a process of this machine, alive at the time `seen` (seconds since 1970), is still alive.
 
-    On Linux, a process that got the same id later does not count. Other systems do not tell when a process began, so
-    there any process with this id counts.
-
-    Args:
-        pid: Id of the process.
-        seen: A time at which the process was alive, in seconds since 1970.
+    On Linux, a process that got the same id later does not count. On other systems any process with this id counts.
     """
     try:
         os.kill(pid, 0)

@@ -17,12 +17,9 @@ MOST_DECODES = 1_000_000  # limit of settings that count decodes of an episode
 def setting(default: Any, help: str = "", **metadata: Any) -> Any:
     """Return a field of a settings dataclass.
 
-    Args:
-        default: The default value, or a function (such as a dataclass) that makes it.
-        help: Description for `--help` and `--cfg`, one line.
-        **metadata: Further facts about the field. `limits` is the allowed range (least, most, above), see the function
-            `limits`. `names` are the allowed values. `group` is the file or part that is chosen by default, for a field
-            that is named like a folder of conf/.
+    `default` is the value, or a function (such as a dataclass) that makes it. `help` is one line for `--help` and
+    `--cfg`. Further facts: `limits` (see the function), `names` (the allowed values), and `group`, the part that is
+    chosen by default for a field that is named like a folder of conf/.
     """
     metadata |= {"help": help} if help else {}
     if callable(default):
@@ -33,30 +30,14 @@ def setting(default: Any, help: str = "", **metadata: Any) -> Any:
 
 
 def limits(least: float = -math.inf, most: float = math.inf, above: float = -math.inf) -> dict[str, Any]:
-    """Return metadata that limit a field's number, or every number in a field's list or mapping.
-
-    None is always allowed. NaN is never allowed.
-
-    Args:
-        least: The smallest allowed value.
-        most: The greatest allowed value.
-        above: A value must be greater than this.
-    """
+    """Return metadata that limit a number, or every number in a list or mapping. None is allowed, NaN is not."""
     return {"limits": (least, most, above)}
 
 
 def number(
     default: float | None, least: float = -math.inf, most: float = math.inf, above: float = -math.inf, help: str = ""
 ) -> Any:
-    """Return a field for a settings dataclass. The field holds a number.
-
-    Args:
-        default: The default value. None means that the number is optional.
-        least: The smallest allowed value.
-        most: The greatest allowed value.
-        above: A value must be greater than this.
-        help: Description for `--help` and `--cfg`, one line.
-    """
+    """Return a field of a settings dataclass that holds a number. A default of None makes it optional."""
     return setting(default, help, **limits(least, most, above))
 
 
@@ -79,13 +60,9 @@ def check_label(label: str) -> str:
 
 
 def check_settings(settings: Any, what: str = "") -> None:
-    """Check all values in a settings dataclass and in the dataclasses inside it.
+    """Check all values in a settings dataclass and in the dataclasses inside it. `what` names it in error messages.
 
     If a dataclass has a method `check_together(prefix)`, it is called to check settings that depend on each other.
-
-    Args:
-        settings: The dataclass.
-        what: Name of the dataclass in error messages, such as `runtime`. Empty if it holds all settings of a command.
     """
     prefix = f"{what}." if what else ""
     for at, element in _declared(type(settings)):  # type: ignore[arg-type]

@@ -27,11 +27,7 @@ def results_dir(results: str) -> Path:
 
 
 def check_writable(results: str) -> Path:
-    """Check that the results folder can be written, before anything is computed. Nothing is created.
-
-    Returns:
-        The results folder if it exists, else the nearest existing folder above it.
-    """
+    """Check that the results folder can be written. Return it, or the nearest existing folder above it."""
     folder = results_dir(results)
     parent = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not parent.is_dir():
@@ -50,10 +46,7 @@ def artifact(results: str, kind: str, name: str) -> Path:
 
 
 def artifact_or_path(results: str, kind: str, name: str) -> Path:
-    """Return the folder from which to read an artifact.
-
-    If `name` contains a slash, it is the path of the folder. Otherwise the folder is the result of `artifact`.
-    """
+    """Return the folder of an artifact: `name` as a path if it contains a slash."""
     return as_path(name) if "/" in name else artifact(results, kind, name)
 
 
@@ -74,24 +67,14 @@ def as_path(text: str) -> Path:
 
 
 def shipped_dir() -> Path:
-    """Return the folder of the shipped policies.
-
-    In a checkout this is `results/pretrained`. Otherwise it is `pretrained` in the installed package, which holds only
-    `mt10-vision`.
-    """
+    """Return the folder of the shipped policies, in a checkout or in the installed package."""
     package = Path(__file__).resolve().parents[1]
     checkout = package.parent / "results" / "pretrained"
     return checkout if checkout.is_dir() else package / "pretrained"
 
 
 def find_target(results: str, name: str) -> Path:
-    """Return the folder of a target.
-
-    Args:
-        results: The results folder.
-        name: A path of the folder if it contains a slash, else the target's name. A name is first looked up among the
-            targets in the results folder, then among the shipped policies.
-    """
+    """Return the folder of a target: a path if `name` has a slash, else of the results folder, else a shipped one."""
     policies = results_dir(results) / "pretrained"
     folders = [artifact_or_path(results, "target", name)]
     if "/" not in name:
@@ -117,13 +100,7 @@ def find_target(results: str, name: str) -> Path:
 
 
 def check_free(path: Path, setting: str, replace: bool) -> None:
-    """Refuse to replace what another command made, unless `replace=true` was typed.
-
-    Args:
-        path: The file or folder to make.
-        setting: The setting that chooses another name, for the error message.
-        replace: Whether `replace=true` was typed.
-    """
+    """Refuse to replace what another command made, unless `replace=true` was typed. `setting` chooses another name."""
     if not replace and (path.is_file() or visible(path)):
         raise UsageError(f"{path} is there already: choose another {setting}=NAME, or type replace=true to replace it")
 
@@ -138,12 +115,7 @@ def new_target(results: str, name: str) -> Path:
 
 
 def check_not_shipped(path: Path, word: str) -> None:
-    """Check that writing an artifact does not replace an artifact of a shipped policy.
-
-    Args:
-        path: Folder to write to.
-        word: Setting that chooses another folder, such as `policy.artifacts.drafter`. Text for the error message.
-    """
+    """Refuse to replace an artifact of a shipped policy. The setting `word` chooses another folder."""
     made_here = (path / RESUME).is_file()
     if path.exists() and (path.parent / "target" / "target.json").is_file() and not made_here:
         raise UsageError(f"{path} is there, as a part of a shipped policy: {word}=NAME makes one of yours")
@@ -162,10 +134,6 @@ def beside(target: Path, kind: str) -> Path:
 
     For a shipped target `pretrained/<name>/target` this is `pretrained/<name>/<kind>`, for a trained target
     `artifacts/target/<name>` it is `artifacts/<kind>/<name>`. For any other target it is `<target>/<kind>`.
-
-    Args:
-        target: Folder of the target.
-        kind: Kind of artifact, such as `drafter`.
     """
     if target.name == "target":
         return target.parent / kind

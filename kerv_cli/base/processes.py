@@ -21,12 +21,9 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA
 def begin_worker(parent: int) -> None:
     """Prepare this process as a worker. The worker ignores Ctrl-C, which its parent handles.
 
-    The worker ends at most a few seconds after its parent. On Linux the kernel ends it, even if it is suspended. The
-    kernel also ends the worker when the thread that started it ends. So start workers from a thread that lives as long
-    as the workers. Libraries that are imported later compute in one thread, because the workers share the cores.
-
-    Args:
-        parent: Process id of the parent.
+    The worker ends at most a few seconds after its parent. On Linux the kernel ends it, also when the thread that
+    started it ends. So start workers from a thread that lives as long as they do. Libraries that are imported later
+    compute in one thread, because the workers share the cores.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     for name in _THREADS:
@@ -62,11 +59,7 @@ class Workers(ProcessPoolExecutor):
 
 
 def end_with_input() -> None:
-    """Make this process end when its standard input is closed, and ignore Ctrl-C.
-
-    The input must be a pipe from the parent. The parent never writes to the pipe. The pipe closes when the parent ends.
-    The parent handles Ctrl-C.
-    """
+    """Make this process end when its standard input, a pipe from the parent, is closed. Ignore Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:

@@ -23,13 +23,8 @@ def chosen(kind: str, name: str = "none") -> Callable[[], Any]:
 def part(kind: str, name: str = "none", help: str = "") -> Any:
     """Return a dataclass field that holds the settings of a part, such as a proposer.
 
-    The user chooses another part with `FIELD=PART` on the command line, such as `threshold=fixed`. So the field must be
-    named like one of `SETTINGS_GROUPS` (`registry.py`).
-
-    Args:
-        kind: Kind of part.
-        name: Name of the part that is chosen by default.
-        help: Description for `--help`.
+    The user chooses another part with `FIELD=PART`, such as `threshold=fixed`. So the field must be named like one of
+    `SETTINGS_GROUPS` (`registry.py`).
     """
     return setting(chosen(kind, name), help, group=name)
 
@@ -80,25 +75,13 @@ class TaskSettings(RunSettings):
 
 
 def choices_of(schema: type) -> dict[str, str]:
-    """Return the groups of conf/ that a command uses, each with the name that is chosen by default.
-
-    If two groups set the same key, the later one wins.
-
-    Args:
-        schema: Dataclass of the command's settings.
-    """
+    """Return the groups of conf/ that a command uses, with their defaults. Of two that set a key, the later wins."""
     parts = {at.name: str(at.metadata["group"]) for at in fields(schema) if "group" in at.metadata}
     return parts | dict(getattr(schema, "groups", {}))
 
 
 def read_settings(schema: type[S], plain: Mapping[str, Any]) -> S:
-    """Return a dataclass of settings from nested dicts and lists. This is the inverse of `asdict`.
-
-    Args:
-        schema: The dataclass.
-        plain: Stored settings. The settings of a part, such as `proposer`, become an instance of the part's settings
-            class.
-    """
+    """Return settings from nested dicts and lists, the inverse of `asdict`. A part's become its own settings class."""
     settings = manifests.read(schema, plain, "a stored setting")
     for group in SETTINGS_GROUPS:
         value = getattr(settings, group, None)

@@ -24,12 +24,7 @@ Message = Mapping[str, Any]
 
 
 def packed(value: object, text_keys: bool = False) -> bytes:
-    """Encode a message with msgpack. A numpy array becomes a map.
-
-    Args:
-        value: Dictionaries, lists, texts, numbers and arrays.
-        text_keys: If true, the keys of an array's map are texts, as in vla-eval. If false, bytes, as in openpi.
-    """
+    """Encode a message with msgpack. The keys of an array's map are texts in vla-eval, bytes in openpi."""
     import msgpack
 
     def plain(value: object) -> object:
