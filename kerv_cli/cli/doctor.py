@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -49,7 +48,7 @@ class DoctorSettings(RunSettings):
     writes=False,
 )
 def doctor(settings: DoctorSettings, as_json: AsJson = False) -> None:
-    """Check rendering, simulator, torch, shipped policies, disk and display; say how to fix each problem.
+    """Check rendering, simulator, torch, shipped policies and disk; say how to fix each problem.
 
     With target=NAME or environment=NAME check only whether that target or environment behaves as kerv requires.
 
@@ -80,7 +79,6 @@ def doctor(settings: DoctorSettings, as_json: AsJson = False) -> None:
 
 
 def check_machine(settings: DoctorSettings) -> list[Finding]:
-    from kerv_cli.report.viewing.viewer import has_display
     from kerv_cli.targets.provenance import versions
     from kerv_cli.worlds import specs
 
@@ -91,12 +89,7 @@ def check_machine(settings: DoctorSettings) -> list[Finding]:
     for folder in filter(Path.is_dir, visible(shipped_dir())):
         checks[f"policy {folder.name}"] = partial(_policy, folder.name, settings)
     checks |= {"results": partial(_disk, settings), "database": partial(_database, settings)}
-    says = "a display is there: kerv view opens a window" if has_display() else "none: kerv view prints the command"
-    return [
-        Finding("versions", True, ", ".join(map(" ".join, versions().items()))),
-        *starmap(find, checks.items()),
-        Finding("display", True, says),
-    ]
+    return [Finding("versions", True, ", ".join(map(" ".join, versions().items()))), *starmap(find, checks.items())]
 
 
 def check_policy(settings: DoctorSettings) -> list[Finding]:
@@ -127,16 +120,9 @@ def _rendering(spec: EnvironmentSpec, settings: DoctorSettings) -> str:
     backend, first = choose_backend(), next(iter(spec.suites.values()), tuple(spec.tasks))[0]
     with spec.open_world(first, replace(settings.world.camera, name="")) as world:
         world.reset(settings.seed)
-        world.frame()
-        began = time.perf_counter()
-        for _ in range(20):
-            frame = world.frame()
-            spread = int(frame.std())  # a broken OpenGL backend can load without an error and render nothing
-        milliseconds = 1000 * (time.perf_counter() - began) / 20
+        spread = int(world.frame().std())  # a broken OpenGL backend can load without an error and render nothing
     need(spread, f"{backend} draws empty frames: set MUJOCO_GL=osmesa and run 'kerv doctor' again")
-    says = f"{backend}, {milliseconds:.1f} ms a frame at {settings.world.camera.size}x{settings.world.camera.size}"
-    need(milliseconds < 50 or spec.extra, says)
-    return says
+    return backend
 
 
 def _torch(settings: DoctorSettings) -> str:
