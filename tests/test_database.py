@@ -21,7 +21,6 @@ from conftest import python, refused, until
 from studies_synthetic import episode, settings_of, still_episode, study_of, swept, threshold_study
 
 from kerv_cli.base.errors import CheckpointError, StorageError, UsageError
-from kerv_cli.catalogue.imports import import_databases
 from kerv_cli.episodes.rows import decodes_table, episode_row
 from kerv_cli.lab import database as module
 from kerv_cli.lab.command import STORE, noted, without_passwords
@@ -155,9 +154,6 @@ def test_a_measure_that_an_older_kerv_did_not_store_is_missing_until_it_is_measu
         file.execute("ALTER TABLE episodes DROP COLUMN closest_approach")
     store = Study(opened(tmp_path / "old"), "threshold")
     assert all(math.isnan(row.measures.near_contact_failure) for row in load_study(store).results)
-    new = opened(tmp_path / "new")
-    import_databases(new, [tmp_path / "old/kerv.db"])
-    assert Study(new, "threshold").frame()["closest_approach"].isna().all()
     swept(tmp_path / "old", study_of({"ar": settings_of("ar")}, ["push-v3"], "later"))
     assert Study(opened(tmp_path / "old"), "later").frame()["closest_approach"].notna().all()
     assert store.frame()["closest_approach"].isna().all()

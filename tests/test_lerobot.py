@@ -25,6 +25,7 @@ from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.openvla.config import Bounds, action_space
 from kerv_cli.worlds import instruction_of, specs
+from kerv_cli.worlds.demos import files
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.dataset import __name__ as dataset_module
 from kerv_cli.worlds.demos.files import encode_png
@@ -403,3 +404,14 @@ def test_a_policy_of_seven_dofs_is_trained_and_decodes_with_its_drafters(spaces)
     tree = Parts(proposer=DrafterProposer(drafter, target, 5, 3, 12))
     for parts in (tree, Parts(prefill_draft=EarlyProposer(early, target))):
         assert Decoder(target, parts).decode(shown).tokens == plain.tokens
+
+
+def test_a_small_parquet_file_that_expands_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "MOST_EXPANDED", 2**24)
+    for name, column in enumerate((pa.array(["x" * 1000] * 50_000), np.zeros(2**22))):
+        path = tmp_path / f"{name}.parquet"
+        pq.write_table(pa.table({"a": column}), path, compression="zstd")
+        with pytest.raises(ValueError, match="expands to more than"):
+            files.foreign_table(path, ["a"])
+    pq.write_table(pa.table({"a": [1, 2, 3], "b": ["x", "y", "z"]}), path, row_group_size=1)
+    assert files.foreign_table(path, ["b", "c"]).to_pylist() == [{"b": "x"}, {"b": "y"}, {"b": "z"}]

@@ -268,3 +268,13 @@ def test_removal_refuses_links_and_parts_of_names(copy, tmp_path):
     for part, said in ((name, "is a link to"), (name[:8], "unknown run"), ("last", "unknown run")):
         refused = kerv("runs", "rm", "-y", part, f"results={copy}", code=2)
         assert said in refused.stderr
+
+
+def test_episodes_and_decodes_as_parquet(tmp_path):
+    store, _ = swept(tmp_path, threshold_study(["reach-v3", "push-v3"]))
+    works("runs", "export", "threshold", "--to", "parquet", "--dir", f"{tmp_path}/out", f"results={tmp_path}")
+    folder = tmp_path / "out/threshold"
+    episodes, decodes = (pd.read_parquet(folder / f"{name}.parquet") for name in ("episodes", "decodes"))
+    assert len(episodes) == len(store.frame()) == 32
+    counted = decodes.groupby(["label", "task", "seed"]).size()
+    assert counted.to_dict() == episodes.set_index(["label", "task", "seed"])["decodes"].to_dict()

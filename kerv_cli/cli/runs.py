@@ -1,8 +1,8 @@
-"""`kerv runs`: list, show, compare, remove, export and import runs: sweeps, rollouts and trainings."""
+"""`kerv runs`: list, show, compare, remove and export runs: sweeps, rollouts and trainings."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import starmap
 from operator import attrgetter
 from pathlib import Path
@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from kerv_cli.base.errors import Interrupted, UsageError
-from kerv_cli.base.limits import setting
-from kerv_cli.base.paths import as_path
 from kerv_cli.base.settings import CommandSettings
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import (
@@ -22,7 +20,6 @@ from kerv_cli.cli.common import (
     print_rows,
     print_table,
     results_word,
-    with_results,
 )
 
 if TYPE_CHECKING:
@@ -215,32 +212,3 @@ def export(
         end_with_json({"folder": folder, "written": written})
     for path in written:
         typer.echo(path)
-
-
-@dataclass(kw_only=True)
-class ImportSettings(CommandSettings):
-    """Settings of `kerv runs import`."""
-
-    name: str = setting("", "new name of the study; empty: studies keep their names")
-
-
-@command("runs import", ImportSettings, keys="name results")
-def import_(settings: ImportSettings, names: list[str], overrides: list[str], as_json: AsJson = False) -> None:
-    """Import the studies of another results folder.
-
-    NAME: kerv.db files, or folders that hold one.
-
-    Examples:
-        kerv runs import old-results
-        kerv runs import old-results/kerv.db name=theirs
-    """
-    from kerv_cli.catalogue.imports import database_in, import_databases
-
-    if not names:
-        raise UsageError("name what to import: 'kerv runs import old-results'")
-    files = [database_in(as_path(name)) for name in names]
-    studies, notes = import_databases(database_of(settings), files, settings.name)
-    if as_json:
-        end_with_json({"studies": studies, "notes": notes})
-    for line in [*notes, f"imported {', '.join(studies) or 'nothing'}: 'kerv runs list' shows what is there"]:
-        typer.echo(with_results(line, overrides))

@@ -39,9 +39,9 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-SWEEP, ROLLOUT, IMPORT = "sweep", "rollout", "import"
-"""Kinds of studies, made by `kerv sweep`, `kerv rollout` and `kerv runs import`."""
-_FOLDERS = {SWEEP: "studies", ROLLOUT: "rollouts", IMPORT: "studies"}
+SWEEP, ROLLOUT = "sweep", "rollout"
+"""Kinds of studies, made by `kerv sweep` and `kerv rollout`."""
+_FOLDERS = {SWEEP: "studies", ROLLOUT: "rollouts"}
 _AT_ONCE = 500  # most values in one SQL IN (…)
 _ROWS = 2000  # rows of a frame that are read at a time
 ABOUT = ("title", "baseline", "axis", "note", "block", "machines")

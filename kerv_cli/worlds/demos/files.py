@@ -215,21 +215,17 @@ def encode_png(frame: NDArray[np.uint8], level: int = 6) -> bytes:
 MOST_EXPANDED = 2**30  # bytes of a table in memory
 
 
-def foreign_table(source: Path | bytes, columns: Sequence[str] = ()) -> pa.Table:
-    """Read a Parquet file that another program wrote. It may be small on disk and huge in memory.
-
-    Args:
-        columns: Names of the columns to read. Names that the file lacks are ignored. If empty, read all columns.
-    """
-    total, name = 0, "a table" if isinstance(source, bytes) else str(source)
-    with pq.ParquetFile(io.BytesIO(source) if isinstance(source, bytes) else regular(source)) as file:
-        chosen = [column for column in file.schema_arrow.names if not columns or column in columns]
+def foreign_table(path: Path, columns: Sequence[str]) -> pa.Table:
+    """Read columns of a Parquet file of another program, which may be huge in memory. Ignore those that it lacks."""
+    total = 0
+    with pq.ParquetFile(regular(path)) as file:
+        chosen = [column for column in file.schema_arrow.names if column in columns]
         schema = pa.schema([file.schema_arrow.field(column) for column in chosen], file.schema_arrow.metadata)
         batches = []
         # few rows at a time, because a file expands as it is read
         for batch in file.iter_batches(256, None, chosen, use_threads=False):
             total += batch.nbytes
             if total > MOST_EXPANDED:
-                raise ValueError(f"{name} expands to more than {MOST_EXPANDED // 2**20} MiB in memory: split it")
+                raise ValueError(f"{path} expands to more than {MOST_EXPANDED // 2**20} MiB in memory: split it")
             batches.append(batch)
     return pa.Table.from_batches(batches, schema)
