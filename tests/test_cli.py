@@ -35,7 +35,7 @@ FAST = ["episodes=2", "world.horizon=8", "record=0"]
         ("import kerv_cli.cli.app", "torch mujoco hydra pandas rerun"),
         ("import kerv_cli.board.app, kerv_cli.report.report", "rerun"),
         ("from kerv_cli.base.registry import parts; parts('proposer')", "torch mujoco numpy pyarrow hydra pydantic"),
-        ("from kerv_cli.worlds import task_names; list(task_names())", "torch mujoco metaworld numpy hydra pydantic"),
+        ("from kerv_cli.worlds import task_names; task_names()", "torch mujoco metaworld hydra pydantic"),
         (f"{INVOKE}['train', 'drafter', '--help'])", "torch numpy hydra pydantic"),
         (f"{INVOKE}['rollout', 'nonsense.key=1'])", "torch numpy pydantic"),
         (f"{INVOKE}['sweep', 'study=demo', 'nonsense.key=1'])", "torch numpy pydantic"),

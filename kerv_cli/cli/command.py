@@ -132,7 +132,7 @@ def _values(part: Command, key: str) -> list[str]:
     if key == "task":
         from kerv_cli.worlds import task_names
 
-        return list(task_names())
+        return task_names()
     for schema in schemas_of(part):
         if key in choices_of(schema):
             return groups()[key]

@@ -6,7 +6,7 @@ environment's specification, and the simulator when a world is opened.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
 
@@ -40,17 +40,10 @@ class Task:
 W = TypeVar("W", bound="WorldSettings")
 
 
-@dataclass(frozen=True, kw_only=True)
 class EnvironmentPart(Part):
-    """An environment. It decorates the function that returns the environment's `EnvironmentSpec`.
-
-    Args:
-        names: Function that returns the names of the environment's suites and tasks without importing numpy. If None,
-            the specification gives these names.
-    """
+    """An environment. It decorates the function that returns the environment's `EnvironmentSpec`."""
 
     kind = "environment"
-    names: Callable[[], tuple[str, ...]] | None = None
 
 
 def specs() -> Mapping[str, EnvironmentSpec]:
@@ -94,14 +87,8 @@ def stands_for_tasks(name: str) -> bool:
     return name == name.lower() and any(spec.expand(name) for spec in specs().values())
 
 
-def task_names() -> Iterator[str]:
-    """Yield the names of all suites and tasks, for shell completion."""
-    for part in EnvironmentPart.every().values():
-        if part.names is not None:
-            yield from part.names()
-        else:
-            spec = part.built()
-            yield from (*spec.suites, *spec.tasks)
+def task_names() -> list[str]:
+    return [name for spec in specs().values() for name in (*spec.suites, *spec.tasks)]
 
 
 def settled(world: W, tasks: Sequence[str]) -> W:
@@ -111,26 +98,14 @@ def settled(world: W, tasks: Sequence[str]) -> W:
     return replace(world, camera=camera, horizon=spec.control_steps(world.horizon, tasks))
 
 
-def _metaworld_names() -> tuple[str, ...]:
-    from kerv_cli.worlds.metaworld.tasks import NAMES
-
-    return NAMES
-
-
-def _libero_names() -> tuple[str, ...]:
-    from kerv_cli.worlds.libero.tasks import NAMES
-
-    return NAMES
-
-
-@EnvironmentPart("metaworld", names=_metaworld_names)
+@EnvironmentPart("metaworld")
 def metaworld() -> EnvironmentSpec:
     from kerv_cli.worlds.metaworld.spec import SPEC
 
     return SPEC
 
 
-@EnvironmentPart("libero", names=_libero_names)
+@EnvironmentPart("libero")
 def libero() -> EnvironmentSpec:
     from kerv_cli.worlds.libero.spec import SPEC
 

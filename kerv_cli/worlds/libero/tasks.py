@@ -32,5 +32,3 @@ for _change in CHANGES:
         TASKS[_name] = Task(_name, _said, _group, HORIZONS[_row["suite"]], _group == "spatial")
         FILES[_name] = f"libero_{_group}", _row["file"]
         SUITES[f"LIBERO_{_group}".upper()] = (*SUITES.get(f"LIBERO_{_group}".upper(), ()), _name)
-
-NAMES = (*SUITES, *TASKS)  # for shell completion

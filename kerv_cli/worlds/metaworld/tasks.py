@@ -27,5 +27,3 @@ _MT10 = (
 )
 
 SUITES = {"MT10": tuple(f"{task}{SUFFIX}" for task in _MT10.split()), "MT50": tuple(TASKS)}
-
-NAMES = (*SUITES, *TASKS)  # for shell completion
