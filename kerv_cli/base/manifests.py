@@ -84,7 +84,6 @@ _hints = functools.cache(get_type_hints)
 
 
 def read_file(kind: type[T], path: Path) -> T:
-    """Read a JSON file into a dataclass. Unknown fields are ignored."""
     value = read_mapping(path)
     digest = value.pop(DIGEST, None)  # files of before version 1.1 have none
     if digest is not None and digest != _digest_of(value):

@@ -46,7 +46,6 @@ def artifact(results: str, kind: str, name: str) -> Path:
 
 
 def artifact_or_path(results: str, kind: str, name: str) -> Path:
-    """Return the folder of an artifact: `name` as a path if it contains a slash."""
     return as_path(name) if "/" in name else artifact(results, kind, name)
 
 
@@ -106,7 +105,6 @@ def check_free(path: Path, setting: str, replace: bool) -> None:
 
 
 def new_target(results: str, name: str) -> Path:
-    """Return the folder of a new target. Names of shipped policies are refused, because they would be shadowed."""
     folder = artifact(results, "target", name)
     for policies in (shipped_dir(), results_dir(results) / "pretrained"):
         if name in RELEASED or (policies / name).is_dir():

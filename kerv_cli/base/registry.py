@@ -141,15 +141,7 @@ class Part:
         return self.settings(kind=self.name)
 
     def check_code(self, group: str, coded: bool) -> None:
-        """Refuse a part that compares tokens by distance, if the target's tokens have no distance.
-
-        Args:
-            group: Name of the setting that chooses the part, for the error message.
-            coded: Whether the target has FAST tokens, which encode whole chunks.
-
-        Raises:
-            UsageError: The part needs a distance.
-        """
+        """Refuse a part that compares tokens by distance, if the tokens are `coded`, so that they have none."""
         if coded and not (self.absent or self.any_code):
             raise UsageError(
                 f"{group}={self.name}: it needs a distance between tokens, and the target's code has none; choose a "
@@ -216,16 +208,13 @@ class DrafterPart(ProposerPart):
     trained: type
 
     def add(self) -> None:
-        """Register the artifact and the proposer."""
         ArtifactPart(self.name, self.trained, code=self.code).add()
         super().add()
 
     def needed(self, settings: Any) -> tuple[str, ...]:
-        """Return the kind of artifact that holds the drafter's weights: the drafter's name."""
         return (self.name,)
 
     def built(self, settings: Any, context: Any) -> Any:
-        """Build the proposer. `Part.built` explains the arguments."""
         return self.code().proposer(settings, context)
 
 
@@ -308,7 +297,6 @@ class ArtifactPart(Part):
     described_by: str = ""
 
     def built(self) -> Any:
-        """Return an instance of the subclass of `Artifact` that makes and loads artifacts of this kind."""
         return self.code()()
 
 
@@ -344,14 +332,10 @@ def part_of(group: str, name: str) -> Part:
 
 
 def parts(kind: str, module: str = "") -> Mapping[str, Part]:
-    """Return the parts of a kind as a map from name to part, in the order of registration.
+    """Return the parts of a kind by name, in the order of registration.
 
-    `kind="drafter"` is a special case. It returns the artifacts that have settings, because only these are trained.
-
-    Args:
-        kind: Kind of part.
-        module: Name of a module in MODULES. Of kerv's own modules, only this one is then imported. If empty, all
-            modules of the kind are imported.
+    `kind="drafter"` returns the artifacts that have settings, because only these are trained. With `module`, a name in
+    MODULES, only this one of kerv's own modules is imported.
     """
     load_plugins()
     if kind == "drafter":

@@ -144,11 +144,6 @@ class ActionSpace:
         return tuple(ranges)
 
     def dofs_of(self, name: str) -> slice:
-        """Return the indices of the DoFs in a kinematic group, as a slice.
-
-        Args:
-            name: Name of the group.
-        """
         first = 0
         for group in self.groups:
             if group.name == name:
@@ -157,11 +152,7 @@ class ActionSpace:
         raise KervError(f"the actions have no group '{name}'")
 
     def segments(self, start: int, stop: int) -> Iterator[tuple[int, int, bool]]:
-        """Divide a range of a chunk's tokens into kinematic groups.
-
-        Args:
-            start: Index of the first token.
-            stop: Index after the last token. A group that is only partly inside is cut.
+        """Divide a chunk's tokens from `start` to before `stop` into kinematic groups, which may be cut at the ends.
 
         Yields:
             For each group: index of its first token, index after its last token, whether all its DoFs are strict.
@@ -239,14 +230,10 @@ class ActionSpace:
         return replace(self, low=low, high=high)
 
     def check_same(self, other: ActionSpace, here: str, there: str, statistics: bool = False) -> None:
-        """Check that another action space has the same names, groups, strict DoFs, bins and control rate.
+        """Refuse another action space with other names, groups, strict DoFs, bins or control rate.
 
-        Args:
-            other: The other space.
-            here: What this space belongs to, text for the error message.
-            there: What the other space belongs to, text for the error message.
-            statistics: Whether to compare `low`, `high`, `end_token` and `code`, too. If these differ, the same token
-                means a different action.
+        With `statistics`, also another `low`, `high`, `end_token` or `code`: then the same token means another action.
+        `here` and `there` say in the error message what the two spaces belong to.
         """
         normalisation = ("low", "high", "end_token", "code") if statistics else ()
         for name in ("names", "groups", "strict", "bins", "control_hz", *normalisation):
