@@ -84,11 +84,11 @@ def test_an_episode_comes_back_as_it_was(database):
     frame = store.frame()
     assert list(frame["seed"]) == list(records)
     for row, record in zip(frame.to_dict("records"), records.values(), strict=True):
-        assert {name: row[name] for name in episode_row(record)} == episode_row(record)
+        stored = row | {"initial_state": list(row["initial_state"])}
+        assert {name: stored[name] for name in episode_row(record)} == episode_row(record)
         assert list(row["decode_seconds"]) == [decode.seconds for decode in record.decodes]
         assert row["device_name"]
-        stored = store.decodes([row["episode"]]).drop_columns("episode")
-        assert stored.equals(decodes_table(record))
+        assert store.decodes([row["episode"]]).drop_columns("episode").equals(decodes_table(record))
     assert store.load().settings[0].settings == study_of({"ar": settings_of("ar")}, ["reach-v3"]).settings[0].settings
 
 
@@ -210,7 +210,7 @@ def test_an_error_text_and_a_state_that_databases_refuse_are_stored(database):
 
     store, outcome = swept(database.results, study, run)
     assert [len(failure.episodes) for failure in outcome.failed] == [4]
-    assert store.frame()["initial_state"].tolist() == [[None, None, 1.5]] * 4
+    assert store.frame()["initial_state"].tolist() == [(None, None, 1.5)] * 4
     with database.reading() as connection:
         errors = set(connection.scalars(sa.select(WANTED.c.error).where(WANTED.c.error.is_not(None))))
     assert all(r"a\x00b \udc80" in error for error in errors)

@@ -166,7 +166,9 @@ def table_blob(table: pa.Table) -> bytes:
 
 
 def read_decodes(blob: bytes, columns: Sequence[str] | None = None) -> pa.Table:
-    return pq.read_table(io.BytesIO(blob), columns=columns, use_threads=False)
+    """Read a table of decodes from bytes that `table_blob` returned. `columns`: names, or None for all."""
+    # pq.read_table takes three times as long for one episode
+    return pq.ParquetFile(pa.BufferReader(blob)).read(columns, use_threads=False)
 
 
 _SAME = (

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import json
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -212,8 +214,8 @@ class Study:
     def frame(self, episodes: Iterable[Episode] | None = None, run: str | None = None) -> pd.DataFrame:
         """Return the episodes that have been run, in the study's order: one row per label, task and seed.
 
-        Its columns are those of the table `episodes`, with `decode_seconds` as an array. Further columns are `run`
-        and the machine and versions that ran the episode.
+        Its columns are those of the table `episodes`, with `decode_seconds` as an array and `initial_state` as a tuple,
+        `run`, and the machine and versions that ran the episode.
 
         Args:
             episodes: Only these episodes; None for all.
@@ -223,12 +225,15 @@ class Study:
         import pandas as pd
 
         which = WANTED.c.episode_id == EPISODES.c.id if run is None else _same_episode()
-        circumstances = EPISODES.c.block, EPISODES.c.order, EPISODES.c.started, EPISODES.c.decode_seconds
+        circumstances = EPISODES.c["block", "order", "started", "decode_seconds"]
+        # the settings of a study share initial states: each is decoded once
+        state = sa.cast(EPISODES.c.initial_state, sa.Text).label("initial_state")
         with self.database.reading() as connection, self.database.checking(f"episodes of {self.name}"):
+            measures = [one for one in measures_in(connection) if one.name != state.name]
             query = (
                 sa.select(
                     SETTINGS.c.label, WANTED.c.task, WANTED.c.seed, EPISODES.c.id.label("episode"),
-                    *measures_in(connection), *circumstances, BLOCKS.c.run,
+                    *measures, state, *circumstances, BLOCKS.c.run,
                 )
                 .select_from(PLANNED.join(EPISODES, which).join(BLOCKS))
                 .where(STUDIES.c.name == self.name, *([] if run is None else [BLOCKS.c.run == run]))
@@ -236,7 +241,8 @@ class Study:
             )  # fmt: skip
             found = connection.execute(query)
             # part by part: the rows as Python objects take ten times the frame's memory
-            parts = [pd.DataFrame.from_records(rows, columns=list(found.keys())) for rows in found.partitions(_ROWS)]
+            rows = (list(map(tuple, some)) for some in found.partitions(_ROWS))
+            parts = [pd.DataFrame.from_records(some, columns=list(found.keys())) for some in rows]
             if not parts:
                 return pd.DataFrame()
             frame = pd.concat(parts, ignore_index=True)
@@ -246,6 +252,7 @@ class Study:
             unknown = frame[numbers].isna().all()
             frame = frame.astype(dict.fromkeys(unknown.index[unknown], float))
             frame["decode_seconds"] = frame["decode_seconds"].map(lambda blob: np.frombuffer(blob, "<f8"))
+            frame["initial_state"] = frame["initial_state"].map(functools.cache(lambda text: tuple(json.loads(text))))
         if episodes is not None:
             chosen = [(one.setting.label, one.task, one.seed) for one in episodes]
             frame = frame[pd.MultiIndex.from_frame(frame[["label", "task", "seed"]]).isin(chosen)]

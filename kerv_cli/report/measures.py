@@ -9,6 +9,7 @@ import csv
 import io
 import itertools
 import math
+from collections import defaultdict
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from numbers import Real
@@ -265,16 +266,18 @@ def measure(
     of_plugins: dict[Any, Any] = means[added].to_dict("index")
     measured: dict[Hashable, Measures] = {}
     found: dict[Any, Any] = means.drop(columns=[*_PHASES, *added]).to_dict("index")
+    numbers: dict[Any, list[list[int]]] = defaultdict(list)
+    for (*group, _), row in zip(counts.index, counts.to_numpy().tolist(), strict=True):  # a row per difficulty group
+        numbers[tuple(group) if len(by) > 1 else group[0]].append(row)
     for group, others in found.items():
-        part = counts.loc[group, :]  # a row per difficulty group
         rates, changes = [], []
-        for successes, worlds, *outcome in part[["successes", "worlds", *outcomes]].to_numpy().tolist():
-            rates.append(stats.wilson(successes, worlds))
+        for solved, worlds, _, _, _, *outcome in numbers[group]:
+            rates.append(stats.wilson(solved, worlds))
             changes.append(stats.paired_difference(PairedCounts(*outcome)))
-        sums = part.sum()
-        pooled = PairedCounts(*sums[outcomes].tolist())
+        successes, _, steps, decodes, deviations, *outcome = map(sum, zip(*numbers[group], strict=True))
+        pooled = PairedCounts(*outcome)
         measured[group] = Measures(
-            successes=int(sums["successes"]),
+            successes=successes,
             success=stats.mean_of(rates),
             phases=phases[group],
             added=of_plugins[group],
@@ -282,9 +285,9 @@ def measure(
             **others,
             **compared(pooled, stats.mean_of(changes)),
             pairs_to_settle=stats.pairs_to_settle(pooled, MARGIN),
-            steps=int(sums["steps"]),
-            decodes=int(sums["decodes"]),
-            deviation_samples=int(sums["deviation_count"]),
+            steps=steps,
+            decodes=decodes,
+            deviation_samples=deviations,
             **speeds.get(group, Speeds())._asdict(),
         )
     return measured
@@ -386,11 +389,14 @@ def speedups(pairs: pd.DataFrame, averaging: str = MICRO, all_pairs: bool = Fals
     decodes = timed["decodes"].to_numpy()
     solved = (timed["success_baseline"].astype(bool) & timed["success_method"].astype(bool)).to_numpy()
 
-    def ratio(column: str, index: np.ndarray) -> Estimate:
-        baseline, method = timed[f"{column}_baseline"].to_numpy(float), timed[f"{column}_method"].to_numpy(float)
-        return stats.speedup(baseline[index], method[index], tasks[index], difficulties[index], clusters[index])
+    numbers = ("time_baseline", "time_method", "seconds_baseline", "seconds_method")
+    times = {name: timed[name].to_numpy(float) for name in numbers}
 
-    untimed = timed["seconds_baseline"].isna().to_numpy() | timed["seconds_method"].isna().to_numpy()
+    def ratio(column: str, index: np.ndarray) -> Estimate:
+        baseline, method = times[f"{column}_baseline"][index], times[f"{column}_method"][index]
+        return stats.speedup(baseline, method, tasks[index], difficulties[index], clusters[index])
+
+    untimed = np.isnan(times["seconds_baseline"]) | np.isnan(times["seconds_method"])
     found = {}
     for group, members in timed.groupby(_GROUPS[averaging]).indices.items():
         index = np.asarray(members)

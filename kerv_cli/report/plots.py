@@ -191,7 +191,7 @@ def _tradeoff(results: Sequence[Result], loss: float, colours: Mapping[str, str]
 
 def lines_figure(panels: Sequence[Panel], colours: Mapping[str, str], ylabel: str | None = None) -> alt.ConcatChart:
     lines = list(dict.fromkeys(point["line"] for panel in panels for point in panel.points))
-    scale = alt.Scale(domain=[*lines, *(set(colours) - set(lines))], range=[])
+    scale = alt.Scale(domain=list(dict.fromkeys([*lines, *colours])), range=[])
     scale.range = [colours[name] for name in scale.domain]
     legend, charts = alt.Legend(orient="bottom", columns=4, title=None, values=lines), []
     alone_scale = alt.Scale(zero=False, padding=12)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import functools
 import math
 from collections.abc import Sequence
 from statistics import NormalDist
@@ -48,12 +49,15 @@ def wilson(successes: float, episodes: float, confidence: float = 0.95) -> Estim
     """
     if episodes == 0:
         return NO_ESTIMATE
-    rate, z = successes / episodes, NormalDist().inv_cdf(0.5 + confidence / 2)
+    rate, z = successes / episodes, _quantile(0.5 + confidence / 2)
     middle, scale = 2 * successes + z**2, 2 * (episodes + z**2)
     reach = z * math.sqrt(z**2 + 4 * successes * (1 - rate))
     low = (middle - reach) / scale if successes else 0.0
     high = (middle + reach) / scale if successes < episodes else 1.0
     return Estimate(rate, low, high)
+
+
+_quantile = functools.cache(NormalDist().inv_cdf)
 
 
 def mean_of(groups: Sequence[Estimate]) -> Estimate:

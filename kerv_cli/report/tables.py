@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from kerv_cli.base.errors import UsageError
@@ -219,8 +220,9 @@ def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyDa
     whole = study.whole_runs() if wanted is None else []
     same_pairs = len(whole) > 2
     frames = [study.frame(run=run) for run in whole] if same_pairs else _with_new_seeds(frame)
-    state = frame.columns.intersection(list(_ONE_STATE))  # imported episodes may lack some columns
-    runs = [_labelled(study, run) for run in frames if all(set(run[name]) == set(frame[name]) for name in state)]
+    # imported episodes may lack some columns
+    states = {name: set(frame[name].unique()) for name in frame.columns.intersection(list(_ONE_STATE))}
+    runs = [_labelled(study, run) for run in frames if all(set(run[name].unique()) == states[name] for name in states)]
     return StudyData(study, _labelled(study, frame), tuple(runs) if len(runs) > 2 else (), same_pairs)
 
 
@@ -237,11 +239,15 @@ def _with_new_seeds(episodes: pd.DataFrame) -> list[pd.DataFrame]:
 def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
     runtimes = pd.DataFrame([one.settings["runtime"] for one in study.settings], study.labels, list(RUNTIME))
     difficulty = episodes["task"].map(functools.cache(difficulty_of))
-    states = episodes["initial_state"].map(tuple)  # tuples can be compared
-    labelled = episodes.assign(difficulty=difficulty, initial_state=states).join(runtimes, on="label")
+    labelled = episodes.assign(difficulty=difficulty).join(runtimes, on="label")
     # strings as Python objects: these frames are cut into hundreds of small ones, and arrow's arrays are slow at that
-    texts = ("label", "task", "block", "started", "device_name", "run", "difficulty", "device", "dtype")
-    return labelled.astype(dict.fromkeys(texts, object))
+    return labelled.assign(**{name: _shared(labelled[name]) for name in labelled.select_dtypes("str")})
+
+
+def _shared(texts: pd.Series) -> pd.Series:
+    """Return the texts as Python objects, with one object for all equal texts."""
+    codes, values = pd.factorize(texts, use_na_sentinel=False)
+    return pd.Series(np.asarray(values, object)[codes], texts.index, dtype=object)
 
 
 def dof_names(task: str, number: int) -> Sequence[str]:
@@ -267,6 +273,7 @@ def _results(data: StudyData, averaging: str) -> list[Result]:
     pooled, by_difficulty = measured(averaging), measured(MACRO) if averaging == MICRO else {}
     texts = data.episodes.reindex(columns=["label", "task", "difficulty", "seed", *_PROVENANCE])
     texts = texts.astype(object).where(texts.notna(), None)
+    shared = {name: _joined(texts[name].unique()) for name in _PROVENANCE if texts[name].nunique(dropna=False) == 1}
     where = texts["task"] if averaging == ONE_TASK else pd.Series("", texts.index)
     groups: Any = texts.groupby([where, pd.Categorical(texts["label"], data.labels)], observed=True)
     results = []
@@ -296,7 +303,7 @@ def _results(data: StudyData, averaging: str) -> list[Result]:
             hashes=hashes,
             stress=stress["kind"],
             stress_level=stress["level"],
-            provenance={name: _joined(part[name].unique()) for name in _PROVENANCE},
+            provenance={name: shared.get(name) or _joined(part[name].unique()) for name in _PROVENANCE},
         )
         results.append(row)
     return results
