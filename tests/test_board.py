@@ -93,7 +93,7 @@ def test_hostile_names_are_text(tmp_path):
         raise KervError(bad)
     client = client_of(tmp_path)
     for path in ("/", f"/?text={bad}&sort={bad}&kind={bad}", "/studies/plain/tables", f"/artifacts/target/{bad}",
-                 "/compare?run=plain&run=plain", f"/studies/{bad}", "/studies/plain/episodes",
+                 f"/studies/{bad}", "/studies/plain/episodes",
                  "/studies/plain/failures", "/episodes/3"):  # fmt: skip
         page = client.get(path).text
         assert "<img" not in page, path
@@ -247,7 +247,7 @@ def names_in(page):
     return page.locator(".runs tbody a").all_inner_texts()
 
 
-def test_runs_are_filtered_sorted_and_compared_with_the_keyboard(address, open_page):
+def test_runs_are_filtered_and_sorted_with_the_keyboard(address, open_page):
     page = open_page(address)
     assert sorted(names_in(page)) == ["few", "radii", "target/mine"]
     page.get_by_label("Search").press_sequentially("naive")
@@ -262,13 +262,6 @@ def test_runs_are_filtered_sorted_and_compared_with_the_keyboard(address, open_p
     page.get_by_role("link", name="episodes").click()
     page.locator("th[aria-sort]", has_text="episodes").wait_for()
     assert names_in(page) == ["radii", "few", "target/mine"]
-    assert page.get_by_role("button", name="Compare two").is_disabled()
-    for name in ("radii", "few"):
-        page.get_by_label(f"compare {name}").focus()
-        page.keyboard.press("Space")
-    page.get_by_role("button", name="Compare two").press("Enter")
-    page.wait_for_url("**/compare?*")
-    assert "radii:ar" in page.locator("main").inner_text()
     page.goto(address)
     page.keyboard.press("Tab")
     page.keyboard.press("Enter")
@@ -318,7 +311,7 @@ def test_a_running_sweep_is_watched_until_it_ends(tmp_path, open_page, monkeypat
 
 def test_pages_fit_a_phone_and_the_dark(address, open_page):
     page = open_page(address, viewport={"width": 360, "height": 740}, color_scheme="dark")
-    for path in ("/", "/studies/radii", "/artifacts/target/mine", "/compare?run=radii&run=few",
+    for path in ("/", "/studies/radii", "/artifacts/target/mine",
                  "/studies/radii/episodes", "/studies/radii/failures", "/episodes/1"):  # fmt: skip
         page.goto(address + path)
         page.wait_for_load_state("networkidle")

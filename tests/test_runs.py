@@ -123,20 +123,17 @@ def test_two_runs_of_a_study_are_compared_setting_by_setting(tmp_path):
         swept(tmp_path, threshold_study(["reach-v3", "push-v3"], name=name))
     pairs = json.loads(works("runs", "compare", "one", "two", f"results={tmp_path}", "--json"))
     assert [pair["first"].partition(":")[2] for pair in pairs] == ["ar", "naive_sd", "spec_vla r=3", "spec_vla r=9"]
-    results = [{row["measure"]: row for row in pair["results"]} for pair in pairs]
-    assert all(rows["speed, per step"]["change"] == 1.0 and rows["success"]["change"] == 0.0 for rows in results)
+    assert {pair["tokens"] for pair in pairs} == {"the same tokens in 8 of 8 episodes"}
+    assert not any(pair["settings"] for pair in pairs)
 
 
-def test_comparison_says_what_differs_in_settings_and_results(results):
+def test_comparison_says_what_differs_in_settings(results):
     grid = next(run["id"] for run in listed(results, "method=spec_vla"))
     (found,) = json.loads(
         works("runs", "compare", f"{grid}:spec_vla r=5", f"{grid}:spec_vla r=9", f"results={results}", "--json")
     )
     assert found["settings"] == [{"key": "threshold.r", "first": 5, "second": 9}]
-    measures = {row["measure"]: row for row in found["results"]}
-    assert measures["pairs"]["change"] == 2
-    assert measures["speed, per step"]["change"] > 0
-    assert measures["success"]["low"] <= measures["success"]["change"] <= measures["success"]["high"]
+    assert found["tokens"] == ""
     single = next(run["id"] for run in listed(results, "method=ar"))
     kerv("runs", "compare", single, "target/nano-state", f"results={results}", code=2)
 
@@ -149,8 +146,6 @@ def test_a_repeated_rollout_has_the_same_tokens_and_a_folder_of_its_own(copy):
     assert again != single
     shown = works("runs", "compare", single, again, f"results={copy}")
     assert "the same tokens in 2 of 2 episodes" in shown
-    assert "not timed in turn" in shown  # they ran one after the other, perhaps on a machine in another state
-    assert "speed, per step" not in shown
     assert "removed" in works("runs", "rm", again, single, "--yes", f"results={copy}")
     assert listed(copy, "method=ar") == []
 

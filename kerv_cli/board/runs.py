@@ -1,4 +1,4 @@
-"""The pages of runs: the start page, a study with its tables and charts, an artifact with its curves, a comparison."""
+"""The pages of runs: the start page, a study with its tables and charts, an artifact with its curves."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable
-from itertools import starmap
 from operator import attrgetter
 from typing import Any
 from urllib.parse import quote, urlencode
@@ -22,7 +21,6 @@ from kerv_cli.catalogue.entries import RunEntry, children, description_of, disk_
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import RUNNING, run_rows
 from kerv_cli.lab.store import Study
-from kerv_cli.report.compare import compare, pairs_to_compare
 from kerv_cli.report.tables import flatten
 
 # Choice of the filter by state -> whether a run is shown
@@ -76,21 +74,11 @@ def show_runs(request: Request, version: str, is_live: bool) -> Response:
         kinds=kinds,
         states=STATES,
         asked=asked,
-        picked=request.query_params.getlist("run"),
         address=address,
         results=database_of(request).results,
         version=version,
         is_live=is_live,
     )
-
-
-def show_comparison(request: Request) -> Response:
-    """Show how two runs differ in settings and results: `/compare?run=A&run=B`."""
-    names = request.query_params.getlist("run")
-    if len(names) != 2:
-        raise UsageError("choose two runs to compare")
-    pairs = pairs_to_compare(database_of(request), *names)
-    return render(request, "compare.html", names=names, comparisons=list(starmap(compare, pairs)))
 
 
 @functools.lru_cache(maxsize=16)
@@ -201,7 +189,6 @@ def _curves(run: RunEntry) -> dict[str, object] | None:
 
 ROUTES = [
     Route("/", show_runs),
-    Route("/compare", show_comparison),
     Route("/studies/{name}", show_study),
     Route("/studies/{name}/tables", show_tables),
     Route("/report/charts.js", send_library),

@@ -125,7 +125,7 @@ def _total_row(row: Any) -> dict[str, object]:
 
 @command("runs compare", writes=False)
 def compare_(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
-    """Compare two runs, ID or ID:SETTING: their settings, results with confidence intervals, and tokens.
+    """Compare two runs, ID or ID:SETTING: what differs in their settings, and how many tokens are the same.
 
     NAME: runs (id, a unique part of it, or last) and results=DIR.
 
@@ -134,7 +134,6 @@ def compare_(settings: CommandSettings, names: list[str], as_json: AsJson = Fals
         kerv runs compare main last
     """
     from kerv_cli.report.compare import compare, pairs_to_compare
-    from kerv_cli.report.measures import is_number
 
     runs = _run_names(names, 2, 2, "two runs, ID or ID:SETTING")
     comparisons = list(starmap(compare, pairs_to_compare(database_of(settings), *runs)))
@@ -146,16 +145,8 @@ def compare_(settings: CommandSettings, names: list[str], as_json: AsJson = Fals
             print_rows(comparison["settings"])
         else:
             typer.echo("no difference in settings, weights, machine or versions")
-        rows = []
-        for row in comparison["results"]:
-            numbers = {name: f"{row[name]:.4g}" for name in ("first", "second", "change")}
-            interval = f"{row['low']:.3g} to {row['high']:.3g}" if is_number(row.get("low")) else ""
-            rows.append({"measure": row["measure"], **numbers, "95 % interval": interval, "": row.get("what", "")})
-        print_rows(rows)
         if comparison["tokens"]:
             typer.echo(comparison["tokens"])
-        if comparison["note"]:
-            typer.echo(comparison["note"])
 
 
 @command("runs rm")

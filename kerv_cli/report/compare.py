@@ -1,4 +1,4 @@
-"""Compare two runs (`kerv runs compare`): which settings differ, and how their results differ."""
+"""Compare two runs (`kerv runs compare`): which settings and tokens differ."""
 
 from __future__ import annotations
 
@@ -13,18 +13,9 @@ from kerv_cli.catalogue.entries import RunEntry, description_of, find_run, store
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Setting, without
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.plan import seeds_text
-from kerv_cli.report.measures import Row, is_number, measure, paired
-from kerv_cli.report.statistics import Estimate
-from kerv_cli.report.summary import DIFFERENCE, SPEEDS
+from kerv_cli.report.measures import Row
 from kerv_cli.report.tables import StudyData, differences, flatten, load_study, split_values
 
-_MEASURES = {
-    "AL": "tokens per verification",
-    "forwards_per_step": "forwards per step",
-    "time_per_step_ms": "time per step, ms",
-    "skip_rate": "decodes skipped, share",
-    "unverified_share": "tokens unverified, share",
-}
 _PROVENANCE = ("host", "device_name", "git_commit", "torch_version", "mujoco_version", "kerv_version")
 
 
@@ -94,25 +85,11 @@ def pairs_to_compare(database: Database, first: str, second: str) -> list[tuple[
 def compare(first: ComparedRun, second: ComparedRun) -> Row:
     """Return the differences between two settings or two trainings, as JSON values.
 
-    Returns:
-        - `first` and `second`: the two names
-        - `settings`: every key whose two values differ, with both values. A missing value is None.
-        - `results`: for each measure both values, the change, and the change's 95 % interval if it is known
-        - `tokens`: how many episodes have the same tokens. Empty if these may differ.
-        - `note`: why there is no ratio of times. Empty if there is a ratio.
+    `settings` has every key whose two values differ; a missing value is None. `tokens` says how many episodes have the
+    same tokens. It is empty if these may differ.
     """
     settings = differences(_settings_of(first), _settings_of(second))
-    if first.data is None or second.data is None:
-        ours, theirs = first.run.figures, second.run.figures
-        results = [_change(name, ours[name], theirs[name]) for name in ours if name in theirs]
-        is_timed = True
-    else:
-        results = _episode_results(first.episodes, second.episodes)
-        is_timed = any(row["measure"] in SPEEDS.values() for row in results)
-    note = "" if is_timed else "no ratio of times: the two were not timed in turn, in one study"
-    tokens = _same_tokens(first, second)
-    names = {"first": first.name, "second": second.name}
-    return {**names, "settings": settings, "results": results, "tokens": tokens, "note": note}
+    return {"first": first.name, "second": second.name, "settings": settings, "tokens": _same_tokens(first, second)}
 
 
 def _settings_of(side: ComparedRun) -> Row:
@@ -138,32 +115,6 @@ def _settings_of(side: ComparedRun) -> Row:
         if name in episodes:
             settings[name] = ";".join(sorted(split_values(episodes[name].dropna())))
     return settings
-
-
-def _episode_results(first: pd.DataFrame, second: pd.DataFrame) -> list[Row]:
-    if first.empty or second.empty:
-        raise UsageError("one of the two settings has no episode yet: run it first")
-    both = pd.concat([first.assign(label="first"), second.assign(label="second")], ignore_index=True)
-    a, b = measure(both, paired(both, {"first": "first", "second": "first"})).values()
-    success = _change("success", a.success.value, b.success.value)
-    rows = [success | _interval(b.difference, DIFFERENCE)]
-    for name, heading in SPEEDS.items():
-        speed = getattr(b, name)
-        if is_number(speed.value):  # not if the two were not measured in turn
-            rows.append(_change(heading, 1.0, speed.value) | _interval(speed, "ratio of times"))
-    for name, heading in _MEASURES.items():
-        ours, theirs = getattr(a, name), getattr(b, name)
-        if is_number(ours) and is_number(theirs) and (ours or theirs):
-            rows.append(_change(heading, ours, theirs))
-    return [*rows, {"measure": "pairs", "first": len(first), "second": len(second), "change": b.pairs}]
-
-
-def _change(name: str, first: float, second: float) -> Row:
-    return {"measure": name, "first": first, "second": second, "change": second - first}
-
-
-def _interval(change: Estimate, what: str) -> Row:
-    return {"change": change.value, "low": change.low, "high": change.high, "what": what}
 
 
 def _same_tokens(first: ComparedRun, second: ComparedRun) -> str:

@@ -3,12 +3,6 @@ document.addEventListener("htmx:beforeRequest", (event) => {
   if (document.hidden && event.target.matches("[hx-trigger*=every], [hx-trigger*=visibilitychange]")) event.preventDefault();
 });
 
-// Only two runs can be compared.
-document.addEventListener("change", (event) => {
-  if (event.target.name !== "run") return;
-  document.getElementById("compare").disabled = document.querySelectorAll("input[name=run]:checked").length !== 2;
-});
-
 // Charts are drawn when a page is loaded, and again when htmx has replaced a part of it. What was open stays open.
 const opened = "details[open], .switch input:checked, .pick[aria-expanded=true]";
 const name = (element) => (element.closest("summary, label, button") ?? element.querySelector("summary")).textContent;
