@@ -2,7 +2,6 @@
 
 import contextlib
 import re
-import shutil
 import signal
 import socket
 import subprocess
@@ -11,12 +10,9 @@ import threading
 import time
 import urllib.request
 from dataclasses import replace
-from pathlib import Path
-from urllib.parse import unquote
 
 import pytest
 import sqlalchemy as sa
-from command import refusal, told
 from conftest import served
 from starlette.testclient import TestClient
 from studies_synthetic import episode, planned, swept, threshold_study, unhurried
@@ -318,48 +314,3 @@ def test_pages_fit_a_phone_and_the_dark(address, open_page):
         assert page.evaluate("document.documentElement.scrollWidth") <= 360, path
         background = page.evaluate("getComputedStyle(document.body).backgroundColor")
         assert max(int(part) for part in re.findall(r"\d+", background)) < 64, path
-
-
-# --- exported ---
-
-
-@pytest.fixture(scope="module")
-def shared(folder, tmp_path_factory):
-    """The board of `folder` as files."""
-    place = tmp_path_factory.mktemp("shared") / "board"
-    told("board", "export", str(place), f"results={folder}")
-    return place
-
-
-def test_every_link_of_an_exported_board_leads_to_a_file(shared):
-    pages = list(shared.rglob("*.html"))
-    assert {"index.html", "studies/radii.html", "studies/few/episodes.html", "artifacts/target/mine.html"} <= {
-        page.relative_to(shared).as_posix() for page in pages
-    }
-    for page in pages:
-        text = page.read_text()
-        for link in re.findall(r'(?:href|src)="([^"]+)"', text):
-            assert link.startswith("data:") or (page.parent / unquote(link)).is_file(), (page, link)
-        assert not re.search(r"\shx-[\w-]+=|<select|type=\"checkbox\" id", text), page
-    assert "spec_vla r=9" in (shared / "studies/radii.html").read_text()
-
-
-def test_an_exported_study_opens_without_a_server(shared, browser):
-    page = browser.new_page()
-    page.goto((shared / "index.html").as_uri())
-    page.get_by_role("link", name="radii").click()
-    page.locator("figure.chart svg").first.wait_for()
-    page.get_by_role("link", name="Episodes").click()
-    page.locator("a.cell").first.click()
-    page.get_by_text("What became of every token").wait_for()
-    page.close()
-
-
-def test_chosen_runs_replace_an_older_export(folder, shared, tmp_path):
-    place, results = Path(shutil.copytree(shared, tmp_path / "board")), f"results={folder}"
-    told("board", "export", str(place), "few", results)
-    assert (place / "studies/few.html").exists()
-    assert not (place / "studies/radii.html").exists()
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine/thesis.tex").touch()
-    assert "holds other files" in refusal("board", "export", str(tmp_path / "mine"), results, code=2)

@@ -82,8 +82,6 @@ def make_app(database: Database) -> Starlette:
         exception_handlers=dict.fromkeys((KervError, HTTPException, Exception), failed),
     )
     app.state.database = database
-    app.state.only = frozenset()  # ids of the runs to list; empty: all
-    app.state.live = True  # False: leave out what works only with the server
     return app
 
 

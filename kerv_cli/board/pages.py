@@ -70,7 +70,7 @@ def refreshed(page: Callable[[Request, str, bool], Response]) -> Callable[[Reque
 
 def render(request: Request, template: str, status: int = 200, **values: Any) -> HTMLResponse:
     """Return a page from a file in `templates/`. The values are escaped."""
-    text = TEMPLATES.get_template(template).render(request=request, live=request.app.state.live, **values)
+    text = TEMPLATES.get_template(template).render(request=request, **values)
     return HTMLResponse(text, status, {CONTENT_POLICY: _OWN_CONTENT})
 
 
