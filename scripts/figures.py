@@ -82,8 +82,7 @@ def _interval(row: Row, name: str, form: str, scale: float = 1.0, between: str =
 
 
 def _is_baseline(row: Row) -> bool:
-    """A table of latencies has AR at the same latency for a baseline."""
-    return row["label"] == row.get("baseline", row.get("ar"))
+    return row["label"] == row.get("baseline")
 
 
 def _ratio(row: Row, name: str) -> str:

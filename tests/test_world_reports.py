@@ -3,7 +3,6 @@
 import dataclasses
 from dataclasses import replace
 
-import pandas as pd
 import pytest
 from studies_synthetic import episode, points_of, settings_of, study_of, swept
 
@@ -12,13 +11,11 @@ from kerv_cli.engine.record import Delay
 from kerv_cli.episodes.identity import Setting, stress_of
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings, SweepSettings, TimingSettings
-from kerv_cli.lab.database import opened
 from kerv_cli.lab.work import RunEpisode
-from kerv_cli.report.plots import latency_figure, study_figures
-from kerv_cli.report.report import report
+from kerv_cli.report.plots import study_figures
 from kerv_cli.report.statistics import PairedCounts
 from kerv_cli.report.summary import summary
-from kerv_cli.report.tables import latency_table, load_study
+from kerv_cli.report.tables import load_study
 from kerv_cli.report.verdict import verdict_of
 from kerv_cli.worlds.settings import StressSettings
 
@@ -159,40 +156,20 @@ def delayed(tmp_path_factory):
     about = {"title": "Latency", "baseline": "ar waits", "axis": "rollout.ar_ms"}
     folder = tmp_path_factory.mktemp("latency")
     store, _ = swept(folder, study_of(settings, TASKS, "latency", **about), run_delayed)
-    return folder, load_study(store).results
+    return load_study(store).results
 
 
 def test_every_setting_is_compared_with_ar_at_its_latency(delayed):
-    _, whole = delayed
-    rows = pd.DataFrame(latency_table(whole)).set_index("label")
-    assert len(rows) == 12  # not the world that waits
-    fast = rows.loc["spec_vla ar_ms=100 none"]
-    assert fast["ar"] == "ar ar_ms=100 none"
-    assert (fast["ar_latency_ms"], fast["felt_latency_ms"]) == pytest.approx((100.0, 40.0))
-    assert (fast["difference"], fast["only_method"], fast["pairs"]) == (1.0, 8, 8)
-    assert fast["difference_low"] > 0.5
-    own = rows.loc["spec_vla ar_ms=0 chunk"]
-    assert (own["ar_latency_ms"], own["felt_latency_ms"]) == pytest.approx((30.0, 12.0))
-    assert own["difference"] == 0.0
-    assert fast["held_share"] == 0.0 < rows.loc["ar ar_ms=100 none"]["held_share"]  # four steps of its chunk, and nine
-    printed = {row["setting"]: row["a decode takes, ms"] for row in summary(whole)}
-    assert (printed["spec_vla ar_ms=100 none"], printed["ar waits"]) == ("40.0", "–")
-    answer = verdict_of(whole, 3.0).sentence
+    rows = {row.label: row for row in delayed}
+    fast, own, ar = (rows[name] for name in ("spec_vla ar_ms=100 none", "spec_vla ar_ms=0 chunk", "ar ar_ms=100 none"))
+    assert fast.baseline == ar.label
+    assert (ar.measures.felt_latency_ms, fast.measures.felt_latency_ms) == pytest.approx((100.0, 40.0))
+    assert rows[own.baseline].measures.felt_latency_ms == pytest.approx(30.0)
+    assert (fast.measures.counts.only_method, fast.measures.pairs) == (8, 8)
+    assert fast.measures.difference.low > 0.5
+    assert own.measures.difference.value == 0.0
+    assert fast.measures.held_share == 0.0 < ar.measures.held_share  # four steps of its chunk, and nine
+    printed = {row["setting"]: row["a decode takes, ms"] for row in summary(delayed)}
+    assert (printed[fast.label], printed["ar waits"]) == ("40.0", "–")
+    answer = verdict_of(delayed, 3.0).sentence
     assert "do not solve the tasks, nothing is compared: ar ar_ms=100 none" in answer
-    assert latency_table([row for row in whole if row.label == "ar waits"]) == []
-
-
-def test_the_figure_has_a_panel_per_compensation_and_a_line_per_method(delayed):
-    figure = latency_figure(delayed[1], latency_table(delayed[1]))
-    assert [panel.title for panel in figure.concat] == ["delay compensation: none", "delay compensation: chunk"]
-    points = points_of(figure)[0]
-    assert list(points["line"].unique()) == ["ar", "spec_vla"]
-    ar = points[points["line"] == "ar"]
-    assert list(ar["x"]) == pytest.approx([20.0, 30.0, 100.0])  # 30: its own latency
-    assert list(ar["value"]) == [100.0, 100.0, 0.0]
-
-
-def test_a_report_has_the_table_and_the_figure(delayed):
-    (written,) = report(opened(delayed[0]), "latency")
-    names = {path.name for path in written.files}
-    assert {"latency.csv", "latency_latency.csv", "report.html"} <= names

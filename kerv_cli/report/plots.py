@@ -215,20 +215,6 @@ def lines_figure(panels: Sequence[Panel], colours: Mapping[str, str], ylabel: st
     return _chart(charts, _ACROSS)
 
 
-def latency_figure(results: Sequence[Result], latencies: Sequence[Mapping[str, Any]]) -> alt.ConcatChart:
-    """Draw success against the AR baseline's latency under the same clock, a panel per delay compensation."""
-    panels: dict[str, dict[str, tuple[str, float | None]]] = {}
-    for row in latencies:
-        if row["ar_latency_ms"] > 0:
-            panel = panels.setdefault(f"delay compensation: {row['rollout.delay_compensation']}", {})
-            panel[row["label"]] = row["method"], row["ar_latency_ms"]
-    colours = colours_of(results)
-    colours |= {row.method: colours[row.label] for row in reversed(results)}
-    xlabel = "an autoregressive decode takes, ms"
-    drawn = [Panel(title, _points(results, SUCCESS, places), xlabel) for title, places in panels.items()]
-    return lines_figure(drawn, colours, "success, %")
-
-
 def acceptance_figure(data: StudyData) -> alt.ConcatChart:
     """Draw the share of accepted draft tokens by position and by DoF, and how many tokens of a draft were accepted.
 

@@ -25,7 +25,7 @@ from kerv_cli.episodes.identity import NOT_DETERMINING, without
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.store import ROLLOUT, SWEEP, Study, studies
 from kerv_cli.report.measures import MACRO, MICRO, Measures, Result, Row, columns_of, csv_text
-from kerv_cli.report.plots import about, acceptance_figure, latency_figure, library, study_figures
+from kerv_cli.report.plots import about, acceptance_figure, library, study_figures
 from kerv_cli.report.profiles import NamedProfile, open_profiles
 from kerv_cli.report.reprice import Priced, own_profiles, prices_table, repriced
 from kerv_cli.report.summary import (
@@ -95,11 +95,9 @@ class Report:
 
     @functools.cached_property
     def figures(self) -> dict[str, alt.ConcatChart]:
-        """The study's charts, by kind: `line`, `tradeoff`, `latency`, `acceptance`."""
+        """The study's charts, by kind: `line`, `tradeoff`, `acceptance`."""
         data = self.data
         figures = study_figures(data.results, data.study.axis, self.loss)
-        if data.latencies:
-            figures["latency"] = latency_figure(data.results, data.latencies)
         if data.tallies:
             figures["acceptance"] = acceptance_figure(data)
         return figures
@@ -146,7 +144,7 @@ def write_study(data: StudyData, loss: float, profiles: Sequence[NamedProfile] =
     """
     priced = repriced(data, profiles) if profiles else repriced(data, own_profiles(data), lenient=True)
     tables = {"": csv_rows(data, data.results), "_per_task": csv_rows(data, data.task_results)}
-    tables |= {"_on": prices_table(priced), "_latency": data.latencies}
+    tables |= {"_on": prices_table(priced)}
     report, folder = Report(data, loss, priced), data.study.database.results / "report" / "tables"
     for suffix, rows in tables.items():
         if rows:

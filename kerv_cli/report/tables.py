@@ -163,10 +163,6 @@ class StudyData:
     def task_results(self) -> list[Result]:
         return with_matched_speed(_results(self, ONE_TASK))
 
-    @functools.cached_property
-    def latencies(self) -> list[Row]:
-        return latency_table(self.results)
-
     @property
     def varied(self) -> list[str]:
         keys = dict.fromkeys(itertools.chain.from_iterable(one.varies for one in self.study.settings))
@@ -394,27 +390,3 @@ def _joined(values: Iterable[object]) -> str:
 
 def split_values(texts: Iterable[object]) -> set[str]:
     return set(";".join(map(str, texts)).split(";"))
-
-
-_LATENCY_COLUMNS = (
-    "study", "label", "method", "ar", "rollout.clock", "rollout.latency", "rollout.latency_ms", "rollout.profile",
-    "rollout.ar_ms", "rollout.delay_compensation", "rollout.batch", "ar_latency_ms", "episodes", "felt_latency_ms",
-    "felt_latency_steps", "held_share", "forwards_per_step", "successes", "success", "success_low", "success_high",
-    "pairs", "difference", "difference_low", "difference_high", "only_baseline", "only_method", "mcnemar_p",
-    "prefill_draft.kind", "proposer.kind",
-)  # fmt: skip
-
-
-def latency_table(results: Sequence[Result]) -> list[Row]:
-    """Return the rows of settings whose world, as their baseline's, goes on during a decode (`rollout.clock=real`).
-
-    `ar_latency_ms` is the mean latency of the baseline's decodes.
-    """
-    felt = {row.label: row.measures.felt_latency_ms for row in results}
-    delayed = []
-    for row in results:
-        latency = felt.get(row.baseline, math.nan)
-        if is_number(row.measures.felt_latency_ms) and is_number(latency):
-            values = row.columns() | {"ar": row.baseline, "ar_latency_ms": latency}
-            delayed.append({name: values.get(name) for name in _LATENCY_COLUMNS})
-    return delayed
