@@ -10,7 +10,6 @@ import pytest
 
 from kerv_cli.report.measures import Measures, Result
 from kerv_cli.report.statistics import NO_ESTIMATE, Estimate, PairedCounts, paired_difference, pairs_to_settle, wilson
-from kerv_cli.report.tables import with_matched_speed
 from kerv_cli.report.verdict import (
     choose,
     order_of,
@@ -78,16 +77,6 @@ def test_the_fastest_setting_before_the_first_that_fails_is_chosen(rows):
         "r=9 loses less than 4 points of success against ar (95 % confidence, 200 pairs) and is faster: "
         "1.50 (1.40–1.60 of this run) times as fast per episode on this machine"
     )
-
-
-def test_the_matched_success_speed_of_a_method_is_that_of_its_fastest_setting_that_keeps_success(rows):
-    """Of r = 3, 9 and 20, the last loses too much. `unverified` is another method. Where AR fails, there is none."""
-    found = {one.label: one.matched_success_speed for one in with_matched_speed(rows)}
-    assert (found["r=3"], found["r=9"], found["r=20"], found["unverified"]) == (1.5, 1.5, 1.5, 5.0)
-    assert math.isnan(found["slow"])
-    assert math.isnan(found["ar"])
-    failing = [replace(one, measures=replace(one.measures, success=wilson(19, 100))) for one in rows]
-    assert all(math.isnan(one.matched_success_speed) for one in with_matched_speed(failing))
 
 
 def test_a_setting_is_called_faster_only_if_its_interval_is_above_one(rows):

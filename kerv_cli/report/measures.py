@@ -140,7 +140,6 @@ class Result:
         settings: All settings as one dictionary with dotted keys, such as `threshold.r`.
         hashes: Hashes of weights and data, by column (`target_sha256`).
         provenance: Machine, versions and the like, by column.
-        matched_success_speed: See `tables.with_matched_speed`.
     """
 
     study: str
@@ -165,7 +164,6 @@ class Result:
     stress: str
     stress_level: int
     provenance: Mapping[str, str]
-    matched_success_speed: float = math.nan
 
     @property
     def is_baseline(self) -> bool:

@@ -51,7 +51,7 @@ CSV_COLUMNS = (
     "solved_speedup_high", "time_per_step_ms", "time_per_episode_ms", "latency_p95_ms", "AL", "forwards_per_step",
     "skip_rate", "unverified_share", "compensation_rate", "retrieval_share", "pairs", "only_baseline", "only_method",
     "mcnemar_p", "difference", "difference_low", "difference_high", "non_inferior", "pairs_to_settle",
-    "steps_to_success", "near_contact_failure", "matched_success_speed",
+    "steps_to_success", "near_contact_failure",
 )  # fmt: skip
 # Points: default for the largest loss of success that the verdict accepts
 LOSS = 3.0

@@ -58,7 +58,6 @@ MEANINGS = {
     OF_SERVER: "mean of the time that the server itself measures for an answer",
     "tokens unverified": "executed tokens that the policy neither wrote nor accepted",
     "tokens per verification": "how many tokens one verification yields on average (acceptance length)",
-    "speed at matched success": "speed of the method's fastest setting that is shown to lose less than 3 points",
     "pairs lost / won": "initial states that only {0}, and only the setting, solved",
     "success, by difficulty": "unweighted mean over the groups of tasks; all other columns pool all tasks",
 }
@@ -133,7 +132,6 @@ def cells_of(row: Result, of: Measures | None = None) -> Cells:
         "deviation from AR": number(of.deviation),
         "failures near the object": share(of.near_contact_failure),
         **{name.replace("_", " "): number(value) for name, value in of.added.items()},
-        "speed at matched success": number(row.matched_success_speed),
         "pairs lost / won": f"{of.counts.only_baseline} / {of.counts.only_method}" if row.is_compared else "",
     }
 

@@ -21,7 +21,6 @@ from kerv_cli.lab.plan import Episode, seeds_text
 from kerv_cli.lab.store import Study
 from kerv_cli.report.measures import (
     MACRO,
-    MARGIN,
     MICRO,
     ONE_TASK,
     Measures,
@@ -157,11 +156,11 @@ class StudyData:
 
     @functools.cached_property
     def results(self) -> list[Result]:
-        return with_matched_speed(_results(self, MICRO))
+        return _results(self, MICRO)
 
     @functools.cached_property
     def task_results(self) -> list[Result]:
-        return with_matched_speed(_results(self, ONE_TASK))
+        return _results(self, ONE_TASK)
 
     @property
     def varied(self) -> list[str]:
@@ -303,31 +302,6 @@ def _results(data: StudyData, averaging: str) -> list[Result]:
         )
         results.append(row)
     return results
-
-
-def with_matched_speed(rows: Sequence[Result]) -> list[Result]:
-    """Add the matched-success speed: one number per method and baseline, the same in each of the method's rows.
-
-    It says how fast a method is at its fastest setting that keeps success (docs/methods.md §7; from WA-SpecDec, arXiv
-    2608.08725), that is, passes `passing` in order of `safety` with a margin of 3 points. It is NaN if no timed setting
-    passes, for the baseline itself, and if the baseline does not solve the tasks.
-    """
-    solved, groups = set(), dict[tuple[str, str, str], list[Result]]()
-    for row in rows:
-        if row.is_baseline and row.measures.success.value >= SOLVED:
-            solved.add((row.where, row.label))
-        if row.is_compared:
-            groups.setdefault((row.where, row.baseline, row.method), []).append(row)
-    fastest: dict[tuple[str, str, str], float] = {}
-    for (where, baseline, method), group in groups.items():
-        if (where, baseline) in solved:
-            speeds = [one.speed for one in passing(sorted(group, key=safety), MARGIN) if one.speed > 0]
-            fastest[where, baseline, method] = max(speeds, default=math.nan)
-    matched = []
-    for row in rows:
-        speed = fastest.get((row.where, row.baseline, row.method), math.nan)
-        matched.append(row if row.is_baseline else replace(row, matched_success_speed=speed))
-    return matched
 
 
 def safety(row: Result) -> tuple[float, float]:
