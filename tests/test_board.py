@@ -136,21 +136,6 @@ def unfinished(address):
     return connection
 
 
-def test_requests_that_are_not_finished_are_dropped(tmp_path, monkeypatch):
-    monkeypatch.setattr(app, "PATIENCE", 0.3)
-    with served(tmp_path) as address, contextlib.ExitStack() as stack:
-        late = stack.enter_context(unfinished(address))
-        late.sendall(b"/ HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
-        assert late.recv(2**16).startswith(b"HTTP/1.1 200")
-        late.sendall(b"GET ")  # a second request, on the same connection
-        waiting = [late, *(stack.enter_context(unfinished(address)) for _ in range(200))]
-        for connection in waiting:
-            connection.settimeout(3)
-            while connection.recv(2**16):
-                pass  # until the server has closed it
-        assert urllib.request.urlopen(address).status == 200
-
-
 def test_a_script_or_style_inside_a_page_does_not_run(address, open_page):
     page = open_page(address, record_troubles=False)
     page.evaluate("""() => {

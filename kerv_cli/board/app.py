@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import socket
 import threading
@@ -21,7 +20,6 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Mount
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.board import episodes, runs
@@ -32,8 +30,6 @@ from kerv_cli.lab.database import Database
 HOST = "127.0.0.1"
 _HOSTS = [HOST, "localhost"]
 _READS = ("GET", "HEAD")
-# Seconds between two checks of a connection. One without a request since the last check is closed.
-PATIENCE = 5.0
 # Seconds for which a stopping board waits for answers that are being computed
 LAST_ANSWERS = 1.0
 
@@ -54,22 +50,6 @@ class SameOrigin:
                 await PlainTextResponse("refused: another site's page sent this", 403)(scope, receive, send)
                 return
         await self.app(scope, receive, send)
-
-
-class Impatient(H11Protocol):
-    """A connection that is closed if it sends no complete request for PATIENCE seconds."""
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        super().connection_made(transport)
-        self.loop.call_later(PATIENCE, self._check, None)
-
-    def _check(self, before: object) -> None:
-        """Close the connection if it waits for a request and has sent none since `before`, its newest."""
-        waits = self.cycle is None or self.cycle.response_complete
-        if waits and self.cycle is before:
-            self.transport.close()
-        elif not self.transport.is_closing():
-            self.loop.call_later(PATIENCE, self._check, self.cycle)
 
 
 def make_app(database: Database) -> Starlette:
@@ -94,7 +74,7 @@ def failed(request: Request, error: Exception) -> Response:
 
 
 def web_server(database: Database, **options: Any) -> uvicorn.Server:
-    return uvicorn.Server(uvicorn.Config(make_app(database), http=Impatient, log_level="critical", **options))
+    return uvicorn.Server(uvicorn.Config(make_app(database), log_level="critical", **options))
 
 
 def serve(database: Database, port: int, opened: Callable[[str], None], browser: bool) -> None:
