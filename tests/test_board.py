@@ -1,6 +1,5 @@
 """`kerv board`: its pages in a browser, what it refuses, and how fast it is."""
 
-import contextlib
 import re
 import signal
 import socket
@@ -18,7 +17,7 @@ from starlette.testclient import TestClient
 from studies_synthetic import episode, planned, swept, threshold_study, unhurried
 
 from kerv_cli.base.errors import KervError
-from kerv_cli.board import app, runs
+from kerv_cli.board import runs
 from kerv_cli.board.app import make_app
 from kerv_cli.episodes.rows import episode_row, seconds_blob
 from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, SETTINGS, WANTED, now, opened

@@ -1,4 +1,4 @@
-"""Compute what a model's decodes cost on GPUs that are not here, and compare with published times. No torch."""
+"""Compute what a model's decodes cost on GPUs that are not here. docs/measuring.md has published times. No torch."""
 
 from __future__ import annotations
 
@@ -11,44 +11,6 @@ from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.episodes.cost import EXTRA_ROUND, Profile
 
 ACTION = 7  # tokens of one action of OpenVLA. Published times are of one action.
-
-
-@dataclass(frozen=True)
-class Anchor:
-    """A published time of one action of OpenVLA-7B: one sequence, seven tokens, vision included.
-
-    Attributes:
-        device: Name in `DEVICES`.
-        engine: The engine that was timed. It is `ROOFLINE` if the source computed the shortest possible time.
-        low: Shortest published time, milliseconds.
-        high: Longest published time, milliseconds.
-        source: Who published the time.
-        weight: Bytes per weight of the language model.
-    """
-
-    device: str
-    engine: Engine
-    low: float
-    high: float
-    source: str
-    weight: float = 2.0
-
-    @property
-    def ours(self) -> float:
-        shape = SHAPES["openvla-7b"]
-        shape = replace(shape, sizes=replace(shape.sizes, weight=self.weight))
-        return 1e3 * priced(shape, DEVICES[self.device], self.engine).decode(ACTION)
-
-
-# Published times of OpenVLA-7B. `tests/test_physics.py` compares them with `ours`. docs/measuring.md has both.
-ANCHORS = (
-    Anchor("h100", ROOFLINE, 30.7, 30.7, "VLA-Perf (NVIDIA, arXiv 2602.18397): vision 0.56, prefill 4.1, tokens 26.0"),
-    Anchor("a100", ROOFLINE, 55.1, 55.1, "VLA-Perf: vision 1.2, prefill 11.2, tokens 42.7"),
-    Anchor("a100", ENGINES["eager"], 170, 199, "Hugging Face code; 174 = vision 8 + trunk 113 + system 53 (HeiSD)"),
-    Anchor("4090", ENGINES["eager"], 162, 229, "Hugging Face code 162 (2026-07) and 229; SGLang 173"),
-    Anchor("3090", ENGINES["eager"], 283, 283, "Hugging Face code (2026-07)"),
-    Anchor("orin", ENGINES["tuned"], 345, 400, "2.5 to 2.9 actions per second in int4", weight=0.5),
-)
 
 
 @dataclass(frozen=True)
@@ -112,12 +74,3 @@ def projection_rows(computed: Iterable[Projection]) -> Iterator[dict[str, str]]:
         row["seven tokens ms"] = f"{1e3 * one.profile.decode(ACTION):.2f}"
         row["floor ms"] = f"{1e3 * one.floors.decode(ACTION):.2f}"
         yield row
-
-
-def anchor_rows() -> Iterator[dict[str, str]]:
-    for one in ANCHORS:
-        row = {"device": DEVICES[one.device].title, "engine": one.engine.name}
-        if one.weight < 1:
-            row["engine"] += ", int4"
-        row["published, ms"] = f"{one.low:g}" if one.low == one.high else f"{one.low:g}–{one.high:g}"
-        yield row | {"ours, ms": f"{one.ours:.1f}", "source": one.source}

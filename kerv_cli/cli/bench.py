@@ -46,11 +46,10 @@ def bench(settings: BenchSettings, as_json: AsJson = False) -> None:
 
 
 def _project(settings: BenchSettings, as_json: bool) -> None:
-    from kerv_cli.bench.projections import anchor_rows, projection_rows, projections
+    from kerv_cli.bench.projections import projection_rows, projections
 
     computed = list(projections(settings))
     print_rows(list(projection_rows(computed)), f"{settings.projected}, computed, not measured")
-    print_rows(list(anchor_rows()), "one action of OpenVLA-7B, as published and as computed")
     for one in computed:
         _write(settings, f"{one.name}-profile", one.document)
     if as_json:
