@@ -36,79 +36,57 @@ RATIO = "ratio"
 
 @dataclass(frozen=True)
 class Measures:
-    """The measured values of a group of episodes. A measure without data is NaN.
+    """The measured values of a group of episodes. A measure without data is NaN."""
 
-    Attributes:
-        successes: Number of solved initial states. Repeats of an initial state are not counted.
-        phases: Milliseconds per control step, by phase of a decode. Keys begin with `ms.`.
-        steps_to_success: Mean number of control steps of the episodes that succeeded.
-        path_m: Mean length of the end effector's path in the episodes that succeeded, metres.
-        jerk: Mean of the episodes' root mean square jerk of the end effector, m/s³.
-        near_contact_failure: Share of the failures in which the hand came near the object.
-        latency_p50_ms: Median time of a decode. `latency_p95_ms` and `latency_worst_ms` are of decodes, too.
-        answer_ms: Mean time of a decode.
-        server_ms: Mean time of an answer as the policy's server measures it.
-        AL: Acceptance length, tokens per verification.
-        accepted_per_round: Accepted draft tokens per verification.
-        AFEP: Mean position of a draft's first rejected token.
-        skip_rate: Share of decodes whose draft was executed without verification.
-        unverified_share: Share of executed tokens that the target did not verify.
-        compensation_rate: Share of decodes in which a prediction, not the target, filled in tokens.
-        retrieval_share: Share of decodes in which retrieval drafted.
-        deviation: Mean absolute difference between the executed actions and AR's, in normalised units.
-        felt_latency_ms: Mean time that the world went on during a decode. `felt_latency_steps`: in control steps.
-        held_share: Share of control steps that repeated the last action, because no newer one had arrived.
-        added: Values of the columns that plugins add, by name.
-        counts: Outcomes of the pairs with the baseline.
-        mcnemar_p: p-value of McNemar's exact test. NaN if there are no pairs.
-        difference: Success rate minus the baseline's success rate.
-        margin: Loss of success, as a share of episodes, below which a setting counts as non-inferior.
-        pairs_to_settle: See `statistics.pairs_to_settle`.
-        same_run: Whether the two episodes of every pair come from one run.
-        same_block: Share of pairs that were measured in one block (side by side in one process).
-        deviation_samples: Number of decodes whose deviation was measured.
-        speedup: Speed relative to the baseline, see `Speeds`.
-    """
-
-    successes: int
+    successes: int  # number of solved initial states. Repeats of an initial state are not counted.
     success: Estimate
     time_per_step_ms: float
     time_per_episode_ms: float
-    phases: Mapping[str, float]
-    steps_to_success: float
-    path_m: float
-    jerk: float
-    near_contact_failure: float
-    latency_p50_ms: float
+    phases: Mapping[str, float]  # milliseconds per control step, by phase of a decode. Keys begin with `ms.`.
+    steps_to_success: float  # mean number of control steps of the episodes that succeeded
+    path_m: float  # mean length of the end effector's path in the episodes that succeeded, metres
+    jerk: float  # mean of the episodes' root mean square jerk of the end effector, m/s³
+    near_contact_failure: float  # share of the failures in which the hand came near the object
+    latency_p50_ms: float  # median time of a decode. `latency_p95_ms` and `latency_worst_ms` are of decodes, too.
     latency_p95_ms: float
     latency_worst_ms: float
-    answer_ms: float = field(metadata={RATIO: ("seconds", "decodes")})
+    answer_ms: float = field(metadata={RATIO: ("seconds", "decodes")})  # mean time of a decode
+    # mean time of an answer as the policy's server measures it
     server_ms: float = field(metadata={RATIO: ("server_seconds", "server_decodes")})
-    AL: float = field(metadata={RATIO: ("committed", "verifications")})
+    AL: float = field(metadata={RATIO: ("committed", "verifications")})  # acceptance length, tokens per verification
+    # accepted draft tokens per verification
     accepted_per_round: float = field(metadata={RATIO: ("accepted", "verifications")})
+    # mean position of a draft's first rejected token
     AFEP: float = field(metadata={RATIO: ("first_rejected_sum", "first_rejected_count")})
     forwards_per_step: float = field(metadata={RATIO: ("forwards", "steps")})
+    # share of decodes whose draft was executed without verification
     skip_rate: float = field(metadata={RATIO: ("skipped_decodes", "decodes")})
+    # share of executed tokens that the target did not verify
     unverified_share: float = field(metadata={RATIO: ("unverified_tokens", "executed_tokens")})
+    # share of decodes in which a prediction, not the target, filled in tokens
     compensation_rate: float = field(metadata={RATIO: ("compensated_decodes", "decodes")})
+    # share of decodes in which retrieval drafted
     retrieval_share: float = field(metadata={RATIO: ("retrieval_decodes", "decodes")})
+    # mean absolute difference between the executed actions and AR's, in normalised units
     deviation: float = field(metadata={RATIO: ("deviation_sum", "deviation_count")})
+    # mean time that the world went on during a decode. `felt_latency_steps`: in control steps.
     felt_latency_ms: float = field(metadata={RATIO: ("delay_seconds", "delay_decodes")})
     felt_latency_steps: float = field(metadata={RATIO: ("delay_steps", "delay_decodes")})
+    # share of control steps that repeated the last action, because no newer one had arrived
     held_share: float = field(metadata={RATIO: ("held_steps", "steps")})
-    added: Mapping[str, float]
-    counts: PairedCounts
-    mcnemar_p: float
-    difference: Estimate
-    margin: float
+    added: Mapping[str, float]  # values of the columns that plugins add, by name
+    counts: PairedCounts  # outcomes of the pairs with the baseline
+    mcnemar_p: float  # p-value of McNemar's exact test. NaN if there are no pairs.
+    difference: Estimate  # success rate minus the baseline's success rate
+    margin: float  # loss of success, as a share of episodes, below which a setting counts as non-inferior
     non_inferior: bool
-    pairs_to_settle: float
-    same_run: bool
-    same_block: float
+    pairs_to_settle: float  # see `statistics.pairs_to_settle`
+    same_run: bool  # whether the two episodes of every pair come from one run
+    same_block: float  # share of pairs that were measured in one block (side by side in one process)
     steps: int
     decodes: int
     deviation_samples: int
-    speedup: Estimate
+    speedup: Estimate  # speed relative to the baseline, see `Speeds`
     episode_speedup: Estimate
     solved_speedup: Estimate
 
@@ -126,44 +104,30 @@ class Result:
     """One row of a study's table: a setting, over all tasks or on one task.
 
     If episodes differ in the value of a text field, the field holds all values, joined by semicolons.
-
-    Attributes:
-        series: Name shared by all settings that differ only in the value of the study's axis (x axis of its chart).
-        unstressed: Label of the same setting without stress.
-        where: The task of a row of one task. Empty for a row over all tasks.
-        tasks: Number of tasks.
-        seeds: Seeds of the episodes, as `seeds_text` writes them.
-        baseline: Label of the setting that this setting is compared with.
-        measures: Measured values, pooled over all episodes.
-        by_difficulty: The unweighted mean over the difficulty groups. None for a row of one task.
-        runs: Number of runs (commands) from which the intervals of speed were computed.
-        settings: All settings as one dictionary with dotted keys, such as `threshold.r`.
-        hashes: Hashes of weights and data, by column (`target_sha256`).
-        provenance: Machine, versions and the like, by column.
     """
 
     study: str
     label: str
-    series: str
-    unstressed: str
+    series: str  # name shared by all settings that differ only in the value of the study's axis (x axis of its chart)
+    unstressed: str  # label of the same setting without stress
     method: str
-    where: str
+    where: str  # the task of a row of one task. Empty for a row over all tasks.
     task: str
     tasks: int
     difficulty: str
-    seeds: str
+    seeds: str  # seeds of the episodes, as `seeds_text` writes them
     episodes: int
-    baseline: str
+    baseline: str  # label of the setting that this setting is compared with
     measures: Measures
-    by_difficulty: Measures | None
-    runs: int
+    by_difficulty: Measures | None  # the unweighted mean over the difficulty groups. None for a row of one task.
+    runs: int  # number of runs (commands) from which the intervals of speed were computed
     overrides: str
-    settings: Mapping[str, Any]
+    settings: Mapping[str, Any]  # all settings as one dictionary with dotted keys, such as `threshold.r`
     observation: str
-    hashes: Mapping[str, str]
+    hashes: Mapping[str, str]  # hashes of weights and data, by column (`target_sha256`)
     stress: str
     stress_level: int
-    provenance: Mapping[str, str]
+    provenance: Mapping[str, str]  # machine, versions and the like, by column
 
     @property
     def is_baseline(self) -> bool:
@@ -342,17 +306,12 @@ def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame
 
 
 class Speeds(NamedTuple):
-    """Speedups of a group of pairs: mean time of the baseline ÷ mean time of the method.
+    """Speedups of a group of pairs: mean time of the baseline ÷ mean time of the method."""
 
-    Attributes:
-        speedup: Per control step.
-        episode_speedup: Per episode.
-        solved_speedup: Per episode, over the pairs that both solved. A failed episode runs to the horizon, so a single
-            one can decide the other two.
-    """
-
-    speedup: Estimate = NO_ESTIMATE
-    episode_speedup: Estimate = NO_ESTIMATE
+    speedup: Estimate = NO_ESTIMATE  # per control step
+    episode_speedup: Estimate = NO_ESTIMATE  # per episode
+    # per episode, over the pairs that both solved. A failed episode runs to the horizon, so a single one can decide
+    # the other two.
     solved_speedup: Estimate = NO_ESTIMATE
 
 

@@ -50,17 +50,12 @@ Places = Mapping[str, tuple[str, float | None]]
 
 
 class Panel(NamedTuple):
-    """One of the charts side by side.
-
-    Attributes:
-        points: A point without x is drawn as a line across the panel.
-        names: Names of the places on the x axis, in order. Empty if x is a number.
-    """
+    """One of the charts side by side."""
 
     title: str
-    points: Sequence[Point]
+    points: Sequence[Point]  # A point without x is drawn as a line across the panel
     xlabel: str
-    names: Sequence[str] = ()
+    names: Sequence[str] = ()  # names of the places on the x axis, in order. Empty if x is a number.
 
 
 def study_figures(results: Sequence[Result], axis: str, loss: float = 3.0) -> dict[str, alt.ConcatChart]:

@@ -21,15 +21,12 @@ ENCODERS = {"encoder_floor": "its floor", "encoder_twice": "twice its floor", "e
 
 @dataclass(frozen=True)
 class NamedProfile:
-    """The costs of one target on one machine, from `kerv bench`, and the name that the user gave.
-
-    Attributes:
-        bounds: For `encode`, `prefill` and `verify` (of one further token), what takes most of the time, such as
-            `reading` (the weights). Empty if the costs were measured.
-    """
+    """The costs of one target on one machine, from `kerv bench`, and the name that the user gave."""
 
     name: str
     profile: Profile
+    # for `encode`, `prefill` and `verify` (of one further token), what takes most of the time, such as `reading` (the
+    # weights). Empty if the costs were measured.
     bounds: Mapping[str, str] = field(default_factory=dict)
 
     @property

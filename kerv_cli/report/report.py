@@ -70,18 +70,12 @@ def to_report(database: Database, study: str | None) -> list[Study]:
 
 @dataclass(frozen=True)
 class Report:
-    """A report on one study: its verdict, charts and written files. Verdict and charts are computed once.
-
-    Attributes:
-        loss: Largest loss of success, in points, that the verdict accepts.
-        priced: The study's speeds on other machines.
-        files: Written files, the page last.
-    """
+    """A report on one study: its verdict, charts and written files. Verdict and charts are computed once."""
 
     data: StudyData
-    loss: float = LOSS
-    priced: Sequence[Priced] = ()
-    files: list[Path] = field(default_factory=list)
+    loss: float = LOSS  # largest loss of success, in points, that the verdict accepts
+    priced: Sequence[Priced] = ()  # the study's speeds on other machines
+    files: list[Path] = field(default_factory=list)  # written files, the page last
 
     @functools.cached_property
     def verdict(self) -> Verdict:

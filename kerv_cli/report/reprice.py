@@ -29,18 +29,12 @@ READ = ("index", "rounds", "similarity", *map("seconds.{}".format, READ_PHASES))
 
 @dataclass(frozen=True)
 class Priced:
-    """How fast a setting would be on another machine, estimated from a cost profile (written by `kerv bench`).
+    """How fast a setting would be on another machine, estimated from a cost profile (written by `kerv bench`)."""
 
-    Attributes:
-        result: The setting's row, as measured.
-        measures: The same, estimated for the machine.
-        encoders: Speeds per episode under other times of the vision encoder, by key of `ENCODERS`. Empty if it is
-            known.
-    """
-
-    result: Result
+    result: Result  # the setting's row, as measured
     machine: NamedProfile
-    measures: Measures
+    measures: Measures  # the same, estimated for the machine
+    # speeds per episode under other times of the vision encoder, by key of `ENCODERS`. Empty if it is known.
     encoders: Mapping[str, float]
 
 
@@ -126,17 +120,11 @@ def own_profiles(data: StudyData, elsewhere: bool = True) -> list[NamedProfile]:
 
 
 class _LabelWork(NamedTuple):
-    """The operations that each decode of a setting executed.
+    """The operations that each decode of a setting executed."""
 
-    Attributes:
-        work: The forwards and drafts of each decode, and the recorded seconds of everything else.
-        episode: (decodes,) number of the decode's episode, from 0, in the order of the setting's episodes.
-        size: N, number of tokens per chunk.
-    """
-
-    work: Work
-    episode: np.ndarray
-    size: int
+    work: Work  # the forwards and drafts of each decode, and the recorded seconds of everything else
+    episode: np.ndarray  # (decodes,) number of the decode's episode, from 0, in the order of the setting's episodes
+    size: int  # N, number of tokens per chunk
 
 
 def _work_of_label(data: StudyData, label: str) -> _LabelWork:

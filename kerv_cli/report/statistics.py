@@ -25,15 +25,11 @@ class PairedCounts(NamedTuple):
     """Counts of the four possible outcomes of a pair. Expected counts may be fractions.
 
     A pair is one episode of the baseline and one of the method, from the same initial state.
-
-    Attributes:
-        only_baseline: Pairs in which only the baseline succeeded.
-        only_method: Pairs in which only the method succeeded.
     """
 
     both: float
-    only_baseline: float
-    only_method: float
+    only_baseline: float  # pairs in which only the baseline succeeded
+    only_method: float  # pairs in which only the method succeeded
     neither: float
 
 

@@ -150,16 +150,11 @@ def columns_shown(rows: Sequence[Cells]) -> set[str]:
 
 @dataclass(frozen=True)
 class SummaryTable:
-    """A study's table as `rich` prints it.
-
-    Attributes:
-        all: Print every column. If they do not fit side by side, they are printed in several parts.
-        how: What to type to see every column. If empty, the table does not mention hidden columns.
-    """
+    """A study's table as `rich` prints it."""
 
     results: Sequence[Result]
-    all: bool = False
-    how: str = ""
+    all: bool = False  # print every column. If they do not fit side by side, they are printed in several parts.
+    how: str = ""  # what to type to see every column. If empty, the table does not mention hidden columns.
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
         results = self.results

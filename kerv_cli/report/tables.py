@@ -57,22 +57,18 @@ _ONE_STATE = ("engine", "git_commit", "device_name")
 
 @dataclass(frozen=True)
 class StudyData:
-    """A study (settings that are compared) with its stored episodes. Tables are computed on first use and then kept.
-
-    Attributes:
-        episodes: One row per stored episode. Columns: those of `Study.frame`, difficulty, device, number format,
-            threads.
-        runs: One table like `episodes` per run (command), all of the same code on the same kind of device. Empty if
-            there are fewer than three.
-        same_pairs: Whether each run measured all episodes of the study. If not, each measured all settings and tasks,
-            on seeds that no other run used.
-        against: Suffix of the names of tables and page, such as `_against_ar`. Empty for the study's own baseline.
-    """
+    """A study (settings that are compared) with its stored episodes. Tables are computed on first use and then kept."""
 
     study: Study
+    # one row per stored episode. Columns: those of `Study.frame`, difficulty, device, number format, threads.
     episodes: pd.DataFrame
+    # one table like `episodes` per run (command), all of the same code on the same kind of device. Empty if there are
+    # fewer than three.
     runs: tuple[pd.DataFrame, ...] = ()
+    # whether each run measured all episodes of the study. If not, each measured all settings and tasks, on seeds that
+    # no other run used.
     same_pairs: bool = False
+    # suffix of the names of tables and page, such as `_against_ar`. Empty for the study's own baseline.
     against: str = ""
 
     @functools.cached_property

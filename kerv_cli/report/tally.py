@@ -20,23 +20,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Tally:
-    """Counts over the verifications of some decodes.
+    """Counts over the verifications of some decodes."""
 
-    Attributes:
-        nodes: Number of verified draft tokens. In a tree, tokens that are not on the accepted path count, too.
-        lengths: Entry k is the number of verifications that accepted k draft tokens.
-        judged: Entry k is the number of verifications that judged k: the accepted tokens and the first rejected one.
-        reached: (D,) number of judged tokens of each DoF.
-        accepted: (D,) number of accepted tokens of each DoF.
-        drift: (D,) sum over these of draft token − target's token, in bins.
-    """
-
-    nodes: int
-    lengths: np.ndarray
+    nodes: int  # number of verified draft tokens. In a tree, tokens that are not on the accepted path count, too.
+    lengths: np.ndarray  # entry k is the number of verifications that accepted k draft tokens
+    # entry k is the number of verifications that judged k: the accepted tokens and the first rejected one
     judged: np.ndarray
-    reached: np.ndarray
-    accepted: np.ndarray
-    drift: np.ndarray
+    reached: np.ndarray  # (D,) number of judged tokens of each DoF
+    accepted: np.ndarray  # (D,) number of accepted tokens of each DoF
+    drift: np.ndarray  # (D,) sum over these of draft token − target's token, in bins
 
     @classmethod
     def of(

@@ -21,30 +21,21 @@ POINTS = 100.0
 
 @dataclass(frozen=True)
 class Choice:
-    """Which setting to take.
+    """Which setting to take."""
 
-    Attributes:
-        pairs: Number of pairs of the setting with the most pairs.
-        baseline_success: Success rate of the baseline.
-        chosen: Fastest setting that is shown to lose less success than the reader accepts. Empty if there is none.
-        candidate: If no setting is chosen, the fastest that would be after more pairs, at these rates. Empty if there
-            is none.
-        candidate_pairs: About how many pairs in all would let the candidate be chosen. NaN without a candidate.
-        tested: Number of settings whose loss of success is tested.
-        untimed: Settings that are not tested, because others were timed and they were not.
-        episode_speedup: Speed per episode of the chosen setting, or else of the candidate.
-        runs: Number of runs (commands) from which the interval of `episode_speedup` was computed.
-    """
-
-    pairs: int
-    baseline_success: float
+    pairs: int  # number of pairs of the setting with the most pairs
+    baseline_success: float  # success rate of the baseline
+    # fastest setting that is shown to lose less success than the reader accepts. Empty if there is none.
     chosen: str = ""
+    # if no setting is chosen, the fastest that would be after more pairs, at these rates. Empty if there is none.
     candidate: str = ""
+    # about how many pairs in all would let the candidate be chosen. NaN without a candidate.
     candidate_pairs: float = math.nan
-    tested: int = 0
-    untimed: tuple[str, ...] = ()
+    tested: int = 0  # number of settings whose loss of success is tested
+    untimed: tuple[str, ...] = ()  # settings that are not tested, because others were timed and they were not
+    # speed per episode of the chosen setting, or else of the candidate
     episode_speedup: stats.Estimate = stats.NO_ESTIMATE
-    runs: int = 0
+    runs: int = 0  # number of runs (commands) from which the interval of `episode_speedup` was computed
 
     @property
     def is_shown(self) -> bool:
@@ -106,16 +97,12 @@ def _fastest(rows: Sequence[Result]) -> Result:
 
 
 class Verdict(NamedTuple):
-    """A study's answer.
-
-    Attributes:
-        is_shown: Whether a setting is shown both to be faster and to lose less success than is accepted.
-        episodes: About how many episodes per task would let the sentence name a setting. 0 if it names one already, if
-            more would not help, or if more than 10,000 pairs would be needed.
-    """
+    """A study's answer."""
 
     sentence: str
-    is_shown: bool = False
+    is_shown: bool = False  # whether a setting is shown both to be faster and to lose less success than is accepted
+    # about how many episodes per task would let the sentence name a setting. 0 if it names one already, if more would
+    # not help, or if more than 10,000 pairs would be needed.
     episodes: int = 0
 
 

@@ -40,17 +40,13 @@ OUTCOMES = {
 
 @dataclass(frozen=True)
 class TokenOutcome:
-    """What happened to one token of a chunk: a key of OUTCOMES, and the tokens at its position, if there were any.
-
-    Attributes:
-        limit: Acceptance threshold r of the token's DoF, in bins.
-    """
+    """What happened to one token of a chunk: a key of OUTCOMES, and the tokens at its position, if there were any."""
 
     kind: str
     token: int | None = None
     draft: int | None = None
     target: int | None = None
-    limit: int | None = None
+    limit: int | None = None  # acceptance threshold r of the token's DoF, in bins
 
 
 def threshold_of(decode: DecodeRecord) -> tuple[int, ...]:

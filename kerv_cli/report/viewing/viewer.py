@@ -128,19 +128,14 @@ def read_chunks(path: Path) -> tuple[RrdReader, list[Chunk]]:
 
 @dataclass(frozen=True)
 class Film:
-    """Images and facts of a recorded episode.
+    """Images and facts of a recorded episode."""
 
-    Attributes:
-        frames: JPEG images, one before the first control step and one after each. Empty if no camera was recorded.
-        hz: Control steps per second.
-        facts: Totals of the episode, as `token_outcomes.facts_of` computed them, and `tokens`, a hash of all tokens.
-        changed: Time when the recording was written, in nanoseconds.
-    """
-
+    # JPEG images, one before the first control step and one after each. Empty if no camera was recorded.
     frames: tuple[bytes, ...]
-    hz: float
+    hz: float  # control steps per second
+    # totals of the episode, as `token_outcomes.facts_of` computed them, and `tokens`, a hash of all tokens
     facts: dict[str, Any]
-    changed: int
+    changed: int  # time when the recording was written, in nanoseconds
 
 
 def film_of(path: Path) -> Film:
