@@ -55,16 +55,11 @@ Lap = tuple[str, float]  # phase of a decode, as in `engine.record.PHASES`, and 
 
 @dataclass(frozen=True)
 class Machine:
-    """What a device can do at best: bytes and operations per second, each the best of several measurements.
+    """What a device can do at best: bytes and operations per second, each the best of several measurements."""
 
-    Attributes:
-        bandwidth: Bytes per second when reading a buffer that is larger than all caches.
-        flops: Operations per second of a large matrix multiplication in the number format of the weights.
-        caches: Bytes per second of smaller buffers that fit into caches, in the order of `_LEVELS`. Empty on a GPU.
-    """
-
-    bandwidth: float
-    flops: float
+    bandwidth: float  # bytes per second when reading a buffer that is larger than all caches
+    flops: float  # operations per second of a large matrix multiplication in the number format of the weights
+    # bytes per second of smaller buffers that fit into caches, in the order of `_LEVELS`. Empty on a GPU.
     caches: tuple[float, ...] = ()
 
     def bandwidth_of(self, read: float) -> float:
@@ -115,29 +110,19 @@ def measure_machine(device: torch.device, dtype: torch.dtype) -> Machine:
 
 @dataclass(frozen=True)
 class Phase:
-    """The measured time of one phase of a decode.
+    """The measured time of one phase of a decode."""
 
-    Attributes:
-        kind: encode, prefill, verify, feed (the drafter reads the target's hidden states), draft (the drafter drafts a
-            chain), tree (the drafter drafts a tree), or early, retrieval (drafts made without the drafter). The
-            last two are measured with the shipped policy, because their time does not depend on the target's size.
-        rows: Number of tokens in a forward or in a drafted chain. Depth of a drafted tree. 1 for the other kinds.
-        seconds: Median of all repeats.
-        p95: 95th percentile of all repeats.
-        least: Minimum of all repeats.
-        read: Bytes that the phase must read. 0 if unknown.
-        flops: Arithmetic operations that the phase needs. 0 if unknown.
-        floor: Shortest possible seconds for these bytes and operations on this device. 0 if unknown.
-    """
-
+    # encode, prefill, verify, feed (the drafter reads the target's hidden states), draft (the drafter drafts a
+    # chain), tree (the drafter drafts a tree), or early, retrieval (drafts made without the drafter). The last two
+    # are measured with the shipped policy, because their time does not depend on the target's size.
     kind: str
-    rows: int
+    rows: int  # number of tokens in a forward or in a drafted chain. Depth of a drafted tree. 1 for the other kinds.
     seconds: float
     p95: float
     least: float
-    read: float
-    flops: float
-    floor: float
+    read: float  # bytes that the phase must read. 0 if unknown.
+    flops: float  # arithmetic operations that the phase needs. 0 if unknown.
+    floor: float  # shortest possible seconds for these bytes and operations on this device. 0 if unknown.
 
     @property
     def name(self) -> str:

@@ -39,20 +39,13 @@ class Model:
 
     A *shape* is a file in conf/target that gives the size of a model, such as its width and number of layers. The
     untrained model has this size and random weights.
-
-    Attributes:
-        name: Name of the policy or of the shape.
-        target: The target, a ReadableTarget.
-        drafter: The policy's drafter, or a drafter with random weights if the policy has no drafter.
-        observation: The observation to decode: all images are black, and all numbers 0.
-        is_shape: Whether the model is untrained, with the size that a shape gives.
     """
 
     name: str
     target: Any
-    drafter: EagleNetwork
-    observation: Observation
-    is_shape: bool
+    drafter: EagleNetwork  # the policy's drafter, or a drafter with random weights if the policy has no drafter
+    observation: Observation  # the observation to decode: all images are black, and all numbers 0
+    is_shape: bool  # whether the model is untrained, with the size that a shape gives
 
     @property
     def sizes(self) -> Sizes:

@@ -27,17 +27,11 @@ CHUNK = 64  # largest number of tokens per chunk for which a computed profile ha
 
 @dataclass(frozen=True)
 class Device:
-    """A GPU, or a computer board that has one.
-
-    Attributes:
-        title: Name in tables.
-        bandwidth: Published bytes per second of the device's memory.
-        flops: Published operations per second of dense matrix multiplications in bfloat16 with sums in float32.
-    """
+    """A GPU, or a computer board that has one."""
 
     title: str
-    bandwidth: float
-    flops: float
+    bandwidth: float  # published bytes per second of the device's memory
+    flops: float  # published operations per second of dense matrix multiplications in bfloat16 with sums in float32
 
 
 # Devices by short name, with the figures of NVIDIA's data sheets. Orin's rate is half of its dense int8 rate.
@@ -51,23 +45,14 @@ DEVICES = {
 
 
 class Needs(NamedTuple):
-    """What a phase of a decode needs on any device.
-
-    Attributes:
-        read: Number of bytes that are read.
-        flops: Number of arithmetic operations.
-        layers: Number of layers of the language model or drafter that run one after the other.
-        blocks: Number of blocks of a vision encoder that run one after the other.
-        kernels: Number of GPU kernels outside of these layers and blocks.
-        asks: Whether the phase runs the target's encoder or trunk.
-    """
+    """What a phase of a decode needs on any device."""
 
     read: float
     flops: float
-    layers: int = 0
-    blocks: int = 0
-    kernels: int = 0
-    asks: bool = False
+    layers: int = 0  # number of layers of the language model or drafter that run one after the other
+    blocks: int = 0  # number of blocks of a vision encoder that run one after the other
+    kernels: int = 0  # number of GPU kernels outside of these layers and blocks
+    asks: bool = False  # whether the phase runs the target's encoder or trunk
 
 
 @dataclass(frozen=True)
@@ -76,28 +61,17 @@ class Engine:
 
     A phase takes its floor (shortest time that the device allows) ÷ `share`, or the time of launching its kernels if
     that is longer. The system time is added.
-
-    Attributes:
-        name: Name of the engine.
-        share: Share of the device's bandwidth and operations per second that the program reaches.
-        launch: Seconds of launching one kernel.
-        layer: Number of kernels per layer of the language model or of the drafter.
-        block: Number of kernels per block of a vision encoder.
-        system: Further seconds of each run of the target's encoder or trunk.
-        draft: Further seconds of each draft of the drafter.
-        extra_round: Whether each decode runs one forward, or one round of drafting and verifying, too many.
-        source: Who measured these figures.
     """
 
     name: str
-    share: float
-    launch: float
-    layer: int
-    block: int
-    system: float
+    share: float  # share of the device's bandwidth and operations per second that the program reaches
+    launch: float  # seconds of launching one kernel
+    layer: int  # number of kernels per layer of the language model or of the drafter
+    block: int  # number of kernels per block of a vision encoder
+    system: float  # further seconds of each run of the target's encoder or trunk
     source: str
-    draft: float = 0.0
-    extra_round: bool = False
+    draft: float = 0.0  # further seconds of each draft of the drafter
+    extra_round: bool = False  # whether each decode runs one forward, or one round of drafting and verifying, too many
 
     def times(self, needs: Needs, device: Device) -> dict[str, float]:
         """Return the seconds of `reading`, `arithmetic`, `launches` and `system time` in a phase, by these names.
@@ -163,31 +137,21 @@ ROOFLINE = Engine("roofline", 1.0, 0.0, 0, 0, 0.0, "the floor: the longer of rea
 
 @dataclass(frozen=True)
 class Sizes:
-    """The sizes of a target, from which the bytes and operations of its forwards are computed.
+    """The sizes of a target, from which the bytes and operations of its forwards are computed."""
 
-    Attributes:
-        layers: Number of weights in the matrices of all layers.
-        head: Number of weights in the head.
-        drafter: Number of weights that a pass of the drafter reads, the head's included.
-        channels: Number of attention channels, summed over all layers. Each takes four operations for every key that a
-            token attends to.
-        cached: Count of numbers that the key/value cache holds for each token, over all layers.
-        weight: Bytes of a weight, on average.
-        slot: Bytes of a number in the key/value cache.
-        padding: Number of tokens that a prefill computes beyond the prompt. 0 except for grown targets, which are
-            enlarged with untrained weights and a longer prompt to cost as much as a larger model.
-        drafter_padding: Number of tokens that the drafter computes beyond the prompt, when it reads the prompt's hidden
-            states.
-    """
-
-    layers: int
+    layers: int  # number of weights in the matrices of all layers
     head: int
-    drafter: int
+    drafter: int  # number of weights that a pass of the drafter reads, the head's included
+    # number of attention channels, summed over all layers. Each takes four operations for every key that a token
+    # attends to.
     channels: int
-    cached: int
-    weight: float
-    slot: float
+    cached: int  # count of numbers that the key/value cache holds for each token, over all layers
+    weight: float  # bytes of a weight, on average
+    slot: float  # bytes of a number in the key/value cache
+    # number of tokens that a prefill computes beyond the prompt. 0 except for grown targets, which are enlarged with
+    # untrained weights and a longer prompt to cost as much as a larger model.
     padding: int = 0
+    # number of tokens that the drafter computes beyond the prompt, when it reads the prompt's hidden states
     drafter_padding: int = 0
 
     @classmethod
@@ -230,21 +194,14 @@ class Sizes:
 
 @dataclass(frozen=True)
 class Shape:
-    """The shape of a VLA, of its drafters and of a datastore.
-
-    Attributes:
-        name: Name of the model.
-        sizes: Sizes of trunk, head and EAGLE's drafter.
-        layers: Number of the trunk's layers.
-        prompt: P, number of prompt tokens.
-        parts: Needs of each phase that runs at most once per decode. The keys are kinds of phase: `encode` (vision
-            towers and projector), `early`, `retrieval`.
-    """
+    """The shape of a VLA, of its drafters and of a datastore."""
 
     name: str
-    sizes: Sizes
+    sizes: Sizes  # sizes of trunk, head and EAGLE's drafter
     layers: int
-    prompt: int
+    prompt: int  # P, number of prompt tokens
+    # needs of each phase that runs at most once per decode. The keys are kinds of phase: `encode` (vision towers and
+    # projector), `early`, `retrieval`.
     parts: Mapping[str, Needs]
 
     def needs(self, kind: str, rows: int) -> Needs:

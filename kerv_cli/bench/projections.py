@@ -18,20 +18,13 @@ class Projection:
     """Computed times of a model's decodes on a device. Nothing was measured.
 
     The times follow from the model's shape, that is from the sizes of its layers and the lengths of its sequences.
-
-    Attributes:
-        name: Name of the profile, such as `a100-openvla-7b-eager`.
-        device: The device.
-        engine: The code that runs the model, such as `eager`.
-        profile: Seconds of each phase of a decode.
-        floors: The shortest seconds that the device allows, for the same phases.
     """
 
-    name: str
+    name: str  # name of the profile, such as `a100-openvla-7b-eager`
     device: Device
     engine: Engine
-    profile: Profile
-    floors: Profile
+    profile: Profile  # seconds of each phase of a decode
+    floors: Profile  # the shortest seconds that the device allows, for the same phases
 
     @property
     def document(self) -> dict[str, Any]:

@@ -22,15 +22,10 @@ from kerv_cli.lab.database import opened
 
 @dataclass(frozen=True)
 class Job:
-    """A recording that the user asked for.
+    """A recording that the user asked for."""
 
-    Attributes:
-        future: Its result is the error as text, or an empty text if the recording was written.
-        asked: Seconds since 1970.
-    """
-
-    future: Future[str]
-    asked: float
+    future: Future[str]  # its result is the error as text, or an empty text if the recording was written
+    asked: float  # seconds since 1970
 
     @property
     def seconds(self) -> int:
