@@ -1,5 +1,6 @@
 """The pages as a site: links, the reference of commands, and figures that are those of the committed tables."""
 
+import ast
 import re
 import subprocess
 import sys
@@ -73,6 +74,25 @@ def test_the_pages_stay_short():
     assert words["methods.md"] <= 6_000
     assert words["measuring.md"] <= 1_500
     assert words["formats.md"] <= 1_300
+
+
+def test_docstrings_are_where_users_and_plugins_read_them():
+    """At most 0.30 lines per line of code, and at most 45 % of functions have one."""
+    code, lines, functions = 0, 0, []
+    for path in (ROOT / "kerv_cli").rglob("*.py"):
+        text, described = path.read_text(encoding="utf-8"), set()
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                functions.append(ast.get_docstring(node, clean=False) is not None)
+            can_have_one = isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+            if can_have_one and ast.get_docstring(node, clean=False) is not None:
+                described.update(range(node.body[0].lineno, node.body[0].end_lineno + 1))
+        written = {number for number, line in enumerate(text.splitlines(), 1) if line.strip()}
+        comments = {number for number, line in enumerate(text.splitlines(), 1) if line.lstrip().startswith("#")}
+        lines += len(written & described)
+        code += len(written - described - comments)
+    assert lines <= 0.30 * code
+    assert sum(functions) <= 0.45 * len(functions)
 
 
 def test_the_site_lists_every_page(docs):
