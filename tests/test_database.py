@@ -3,8 +3,6 @@
 import contextlib
 import dataclasses
 import json
-import math
-import os
 import resource
 import signal
 import sqlite3
@@ -27,7 +25,6 @@ from kerv_cli.lab.command import STORE, noted, without_passwords
 from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, FILE, RUNS, STUDIES, WANTED, Database, Unanswered, opened
 from kerv_cli.lab.runs import Run, making, pulse, run_rows, time_left
 from kerv_cli.lab.store import Study, studies
-from kerv_cli.report.tables import load_study
 from kerv_cli.training.demonstrations import open_demos
 
 STUDY = threshold_study(["reach-v3"])
@@ -148,17 +145,6 @@ def test_a_kill_in_a_transaction_leaves_nothing(database, tmp_path):
     assert count(database, STUDIES) == 2
 
 
-def test_a_measure_that_an_older_kerv_did_not_store_is_missing_until_it_is_measured(tmp_path):
-    swept(tmp_path / "old", STUDY)
-    with contextlib.closing(sqlite3.connect(tmp_path / "old" / FILE)) as file:
-        file.execute("ALTER TABLE episodes DROP COLUMN closest_approach")
-    store = Study(opened(tmp_path / "old"), "threshold")
-    assert all(math.isnan(row.measures.near_contact_failure) for row in load_study(store).results)
-    swept(tmp_path / "old", study_of({"ar": settings_of("ar")}, ["push-v3"], "later"))
-    assert Study(opened(tmp_path / "old"), "later").frame()["closest_approach"].notna().all()
-    assert store.frame()["closest_approach"].isna().all()
-
-
 @pytest.mark.parametrize(
     ("schema", "message"),
     [(0, "newer kerv"), (99, "of kerv 1.0 (schema 2, this one reads 99): choose another folder with results=")],
@@ -220,28 +206,8 @@ def test_an_error_text_and_a_state_that_databases_refuse_are_stored(database):
 
 
 @pytest.mark.parametrize("database", ["postgresql"], indirect=True)
-def test_a_server_that_freezes_is_one_line(database, monkeypatch):
-    monkeypatch.setattr("kerv_cli.lab.postgresql.STATEMENT_SECONDS", 1)
-    monkeypatch.setattr("kerv_cli.lab.postgresql._SPARE_SECONDS", 0)
-    begun(database, "a")
-    frozen = []
-    try:
-        with (
-            refused("no answer for 1 s", "check that the server", error=StorageError),
-            database.reading() as connection,
-        ):
-            frozen.append(connection.scalar(sa.text("SELECT pg_backend_pid()")))
-            os.kill(frozen[0], signal.SIGSTOP)
-            connection.scalar(sa.text("SELECT 1"))
-        assert len(studies(database)) == 1  # over a new connection
-    finally:
-        for pid in frozen:
-            os.kill(pid, signal.SIGCONT)
-
-
-@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 def test_a_statement_that_takes_too_long_ends(database, monkeypatch):
-    monkeypatch.setattr("kerv_cli.lab.postgresql.STATEMENT_SECONDS", 1)
+    monkeypatch.setattr("kerv_cli.lab.database.STATEMENT_SECONDS", 1)
     with refused("statement timeout", error=StorageError), database.reading() as connection:
         connection.execute(sa.text("SELECT pg_sleep(20)"))
     with refused("refused a statement", "check the rights", error=StorageError), database.reading() as connection:
@@ -250,7 +216,7 @@ def test_a_statement_that_takes_too_long_ends(database, monkeypatch):
 
 @pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 def test_a_suspended_transaction_lets_others_write(database, monkeypatch):
-    monkeypatch.setattr("kerv_cli.lab.postgresql.IDLE_SECONDS", 1)
+    monkeypatch.setattr("kerv_cli.lab.database.IDLE_SECONDS", 1)
     number = sa.select(sa.func.count()).select_from(RUNS)
     with refused("failed", "check that the server runs", error=Unanswered), database.writing() as suspended:
         suspended.execute(sa.text("LOCK TABLE runs"))

@@ -11,7 +11,7 @@ import sqlalchemy as sa
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.engine.record import DecodeRecord
-from kerv_cli.lab.database import BLOCKS, EPISODES, SETTINGS, STUDIES, WANTED, Database, measures_in
+from kerv_cli.lab.database import BLOCKS, EPISODES, MEASURES, SETTINGS, STUDIES, WANTED, Database
 from kerv_cli.lab.plan import Episode
 from kerv_cli.lab.store import Study, setting_of
 
@@ -25,11 +25,10 @@ def outcomes(store: Study, task: str = "", seed: int | None = None) -> list[Any]
     `closest_approach`, `object_moved`, `failed` (whether the last attempt to run it raised an error).
     """
     with store.database.reading() as connection:
-        measures = {one.name: one for one in measures_in(connection)}
         query = (
             sa.select(
                 SETTINGS.c.label, WANTED.c.task, WANTED.c.seed, WANTED.c.episode_id.label("episode"),
-                measures["success"], measures["closest_approach"], measures["object_moved"],
+                *EPISODES.c["success", "closest_approach", "object_moved"],
                 WANTED.c.error.is_not(None).label("failed"),
             )
             .select_from(WANTED.join(SETTINGS).join(STUDIES).outerjoin(EPISODES, EPISODES.c.id == WANTED.c.episode_id))
@@ -95,7 +94,7 @@ def find_episode(database: Database, number: int) -> FoundEpisode:
         own = EPISODES.c["task", "seed", "order", "block", "started"]
         about = STUDIES.c.name.label("study"), STUDIES.c.kind, BLOCKS.c.about
         query = (
-            sa.select(SETTINGS, *about, *own, *measures_in(connection))
+            sa.select(SETTINGS, *about, *own, *MEASURES)
             .select_from(WANTED.join(SETTINGS).join(STUDIES).join(EPISODES).join(BLOCKS))
             .where(WANTED.c.episode_id == min(number, LARGEST_ID))
             .order_by(STUDIES.c.id.desc())

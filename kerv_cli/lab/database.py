@@ -14,7 +14,6 @@ import sqlite3
 import threading
 from collections.abc import Iterator
 from datetime import UTC, datetime
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +27,14 @@ from kerv_cli.lab.command import current_store, without_passwords
 
 FILE = "kerv.db"
 SCHEMA = 2
-"""Version of the tables. A database with another version is refused.
-
-A new column in MEASURES needs no new version: it is added at the next write. Until then it reads as null.
-"""
+"""Version of the tables. A database with another version is refused."""
 LOCK_SECONDS = 60
 """Longest time to wait for another process's transaction in a SQLite file, seconds."""
+STATEMENT_SECONDS = 30
+"""Longest time that a statement may take on a server, waiting for other transactions included, seconds."""
+IDLE_SECONDS = 20
+"""Longest time between two statements of a transaction, seconds. A transaction may hold locks for which others wait."""
+CONNECT_SECONDS = 5
 
 _META = sa.MetaData()
 
@@ -193,7 +194,6 @@ class Database:
         self.shown = str(self.file or without_passwords(str(url)))
         self._url = parsed if self.file else parsed.set(drivername="postgresql+psycopg")
         self._engine: sa.Engine | None = None
-        self._is_complete = False  # whether all tables and columns are known to exist
 
     @property
     def store(self) -> str:
@@ -255,10 +255,7 @@ class Database:
         with self._errors():
             engine = self._opened(create=True).execution_options(kerv_writes=True)
             with engine.begin() as connection:
-                if not self._is_complete:
-                    _add_measures(connection)
                 yield connection
-            self._is_complete = True
 
     def _opened(self, create: bool = False) -> sa.Engine:
         if self._engine is None:
@@ -345,17 +342,13 @@ def file_url(results: Path) -> sa.URL:
 
 @functools.cache
 def _server(url: sa.URL) -> sa.Engine:
-    """Return the SQLAlchemy engine for a server. It is shared within this process.
-
-    Raises:
-        UsageError: The package psycopg is not installed.
-    """
+    options = f"-c statement_timeout={STATEMENT_SECONDS}s -c idle_in_transaction_session_timeout={IDLE_SECONDS}s"
+    ends = {"keepalives_idle": 10, "keepalives_interval": 5, "keepalives_count": 2, "tcp_user_timeout": 20_000}
+    limits = {"connect_timeout": CONNECT_SECONDS, "options": options, **ends}
     try:
-        from kerv_cli.lab.postgresql import connect
+        engine = sa.create_engine(url, pool_pre_ping=True, connect_args=limits)
     except ModuleNotFoundError:
         raise UsageError("store=postgresql:// needs the package psycopg: pip install 'kerv[postgres]'") from None
-    engine = sa.create_engine(url, pool_pre_ping=True)
-    sa.event.listen(engine, "do_connect", connect)
     sa.event.listen(engine, "begin", _begin)
     return engine
 
@@ -430,27 +423,6 @@ def _created(connection: sa.Connection) -> int:
         _META.create_all(connection)
         connection.execute(sa.insert(ABOUT).values(key="schema_version", value=str(SCHEMA)))
     return SCHEMA if version is None else version
-
-
-def measures_in(connection: sa.Connection) -> list[sa.ColumnElement[Any]]:
-    """Return the columns with results (MEASURES) of the table of episodes, for use in a query.
-
-    If an older kerv made the table, columns may be missing. A missing column reads as null in every row.
-    """
-    stored = set(map(itemgetter("name"), sa.inspect(connection).get_columns(EPISODES.name)))
-    return [EPISODES.c[one.name] if one.name in stored else sa.null().label(one.name) for one in MEASURES]
-
-
-def _add_measures(connection: sa.Connection) -> None:
-    """Add the columns with results (MEASURES) that the table of episodes lacks, because an older kerv made it.
-
-    The older kerv can still use the table.
-    """
-    quote = connection.dialect.identifier_preparer.quote
-    for column, found in zip(MEASURES, measures_in(connection), strict=True):
-        if not isinstance(found, sa.Column):
-            kind = column.type.compile(connection.dialect)
-            connection.execute(sa.text(f"ALTER TABLE {EPISODES.name} ADD COLUMN {quote(column.name)} {kind}"))
 
 
 def other_schema(name: str | Path, version: int) -> CheckpointError:

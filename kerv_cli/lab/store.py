@@ -31,7 +31,6 @@ from kerv_cli.lab.database import (
     WANTED,
     Damaged,
     Database,
-    measures_in,
     now,
 )
 from kerv_cli.lab.plan import Episode, Key, StoredEpisode
@@ -229,7 +228,7 @@ class Study:
         # the settings of a study share initial states: each is decoded once
         state = sa.cast(EPISODES.c.initial_state, sa.Text).label("initial_state")
         with self.database.reading() as connection, self.database.checking(f"episodes of {self.name}"):
-            measures = [one for one in measures_in(connection) if one.name != state.name]
+            measures = [one for one in MEASURES if one.name != state.name]
             query = (
                 sa.select(
                     SETTINGS.c.label, WANTED.c.task, WANTED.c.seed, EPISODES.c.id.label("episode"),
