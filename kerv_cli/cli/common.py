@@ -192,13 +192,10 @@ def made(plan: Plan[T], database: Database, show: bool = False, as_json: bool = 
     With `show`, print only what would be made and how long that takes, and end the command.
     """
     from kerv_cli.lab import runs
-    from kerv_cli.lab.command import current_command
 
     if show:
-        time = runs.time_of(database, plan.kind, current_command(), plan.units)
-        if plan.seconds and time.startswith("time unknown"):
-            time = about(plan.seconds(), "from a few steps, measured now")
-        end_with_plan(f"{plan.text}, {time}", as_json)
+        time = f", {about(plan.seconds(), 'from a few steps, measured now')}" if plan.seconds else ""
+        end_with_plan(f"{plan.text}{time}", as_json)
     with runs.making(database, plan.kind, plan.folder) as run:
         yield plan.make(lambda title: progress_bar(title, run))
 

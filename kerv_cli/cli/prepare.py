@@ -29,7 +29,6 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
         kerv prepare policy.target=mine quick=true --plan
     """
     from kerv_cli.cli.app import app
-    from kerv_cli.lab.runs import time_of
     from kerv_cli.training.preparation import THERE
     from kerv_cli.training.preparation import plan as planned
 
@@ -42,9 +41,6 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
         rows.append((step.kind, step.state, f"kerv {shlex.join(lines[step.kind])}"))
     print_table(("what", "state", "command"), rows, name)
     if plan:
-        for step in steps:
-            if step.state != THERE:
-                typer.echo(f"{step.kind}: {time_of(database, step.kind, lines[step.kind], step.steps)}")
         return
     for kind, line in lines.items():
         # planned again before each step: an artifact that was just made can make a later one outdated

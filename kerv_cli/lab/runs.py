@@ -5,7 +5,6 @@ A row says which process runs the command, how far it is, and how it ended.
 
 from __future__ import annotations
 
-import math
 import secrets
 import socket
 from collections.abc import Sequence
@@ -16,7 +15,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from kerv_cli.base.durations import about, left
+from kerv_cli.base.durations import left
 from kerv_cli.base.errors import CheckpointError, Interrupted, StorageError, UsageError
 from kerv_cli.lab.command import current_command
 from kerv_cli.lab.database import EPISODES, RUNS, STUDIES, WORKERS, Database, now
@@ -24,9 +23,6 @@ from kerv_cli.lab.presence import Presence, living
 from kerv_cli.targets.provenance import git_commit
 
 RUNNING, COMPLETE, FAILED, INTERRUPTED = "running", "complete", "failed", "interrupted"
-
-LOADING_SECONDS = 5.0
-"""Guess of the seconds that every command takes to load libraries and the simulator, whatever its amount of work."""
 
 
 @dataclass(frozen=True)
@@ -91,52 +87,6 @@ def time_left(row: RunRow) -> str:
     if row.status != RUNNING or not 0 < row.done < row.total:
         return ""
     return left(row.seen - datetime.fromisoformat(row.started).timestamp(), row.done, row.total)
-
-
-def time_of(database: Database, kind: str, command: Sequence[str], units: int = 0) -> str:
-    """Estimate how long a command will take, from an earlier command with the same options on this machine.
-
-    Names, tasks and numbers of steps or episodes may differ. Of several earlier commands, the command with the most
-    similar number of units is used. If several are equally similar, the newest of them is used. Resumed and repeated
-    commands are not used.
-
-    Args:
-        database: The database.
-        kind: Kind of the artifact that the command makes.
-        command: Command-line arguments after `kerv`.
-        units: Number of steps or episodes. If 0, as many are assumed as the newest earlier command had.
-
-    Returns:
-        The duration and the earlier command's artifact as text. If there is no such command, the text says so.
-    """
-    rows = run_rows(database, kind)
-    first, wanted = {row.name: row.id for row in rows}, _options(command)
-    similar = []
-    for row in rows:
-        is_whole = row.status == COMPLETE and row.finished and first[row.name] == row.id and (row.total or not units)
-        if is_whole and row.host == socket.gethostname() and _options(row.command) == wanted:
-            similar.append(row)
-    if not similar:
-        return "time unknown, nothing like it has run on this machine"
-    row = min(similar, key=lambda row: abs(math.log(units / row.total))) if units else similar[0]
-    seconds = (datetime.fromisoformat(str(row.finished)) - datetime.fromisoformat(row.started)).total_seconds()
-    loading = min(LOADING_SECONDS, seconds / 2)
-    scaled = loading + (seconds - loading) * (units / row.total if units else 1)
-    return about(scaled, f"at the speed of {kind}/{row.name}")
-
-
-_SIZES = ("name", "task", "demos", "episodes", "seed", "train.steps", "results", "store", "policy.target")
-"""Settings in which two commands may differ although they need the same time per step or episode."""
-
-
-def _options(command: Sequence[str]) -> set[str]:
-    """Return the arguments of a command that can make it faster or slower."""
-    options = set()
-    for word in command:
-        key = word.split("=")[0]
-        if key not in _SIZES and not key.startswith(("--", "policy.artifacts")):
-            options.add(word)
-    return options
 
 
 def pulse(database: Database) -> tuple[str, bool]:

@@ -239,7 +239,7 @@ def plan_demos(settings: DemosSettings) -> Plan[tuple[Path, DemoManifest]]:
 
     check()
     text = f"{count(len(config.tasks), 'task')} x {count(settings.episodes, 'episode')} -> {folder}"
-    return Plan("demos", folder, text, work, check, len(config.tasks) * settings.episodes)
+    return Plan("demos", folder, text, work, check)
 
 
 def recording_of(settings: DemosSettings) -> tuple[DemoConfig, PolicyActs | None]:

@@ -128,4 +128,4 @@ def plan_drafter(settings: TrainDrafterSettings, database: Database) -> Plan[tup
     samples = f", greedy decodes of {shape['samples']} observations" if "samples" in shape else ""
     text = f"{folder}: {layers}{drafter.noun} of {artifacts.folder}{samples}, {train.steps} steps of {train.batch}"
     training = DrafterTraining(settings, drafter, artifacts, dataset, place)
-    return Plan(drafter.kind, folder, text, training.work, place.check, train.steps, training.seconds)
+    return Plan(drafter.kind, folder, text, training.work, place.check, training.seconds)

@@ -17,7 +17,7 @@ from kerv_cli.methods.artifacts import Artifacts, kind_of
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.drafters import TrainableDrafter
 from kerv_cli.training.demonstrations import demos_for
-from kerv_cli.training.settings import PrepareSettings, TrainDrafterSettings
+from kerv_cli.training.settings import PrepareSettings
 
 THERE, MISSING, INCOMPLETE = "there", "missing", "incomplete"
 
@@ -31,13 +31,11 @@ class Step:
         state: `there`, `missing`, `unfinished`, `incomplete` (a calibration without some numbers), `of other artifacts`
             (it was made from artifacts that have been replaced since) or, while it trains, `step 300 of 4000`.
         command: Command-line arguments after `kerv` that make the artifact, without the arguments that all steps share.
-        steps: Number of optimisation steps. 0 if the artifact is made without training.
     """
 
     kind: str
     state: str
     command: tuple[str, ...]
-    steps: int = 0
 
 
 def plan(settings: PrepareSettings, database: Database) -> list[Step]:
@@ -49,15 +47,13 @@ def plan(settings: PrepareSettings, database: Database) -> list[Step]:
     steps: list[Step] = []
     for kind in kinds:
         files = kind_of(kind)
-        command, number = files.command, 0
-        if isinstance(files, TrainableDrafter):
-            if settings.steps:
-                command = (*command, f"train.steps={settings.steps}")
-            number = compose("train_drafter", command[2:], TrainDrafterSettings).train.steps
+        command = files.command
+        if isinstance(files, TrainableDrafter) and settings.steps:
+            command = (*command, f"train.steps={settings.steps}")
         state = _state(artifacts, database, kind, kinds, settings.replace)
         if state == INCOMPLETE:
             command = (*command, "complete=true")
-        steps.append(Step(kind, state, command, number))
+        steps.append(Step(kind, state, command))
     if any(step.state != THERE for step in steps):
         demos_for(settings, description, database)
     return steps

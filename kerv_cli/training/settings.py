@@ -42,8 +42,7 @@ class Plan(Generic[T]):
         text: What would be made, for `--plan`.
         work: Function that makes the artifact, and shows its stages.
         check: Called again before the work. It refuses to replace what is there.
-        units: Number of optimisation steps or episodes. 0 if unknown.
-        seconds: Measures how long the work takes, for `--plan` on a machine that has done nothing like it.
+        seconds: Measures how long the work takes, for `--plan`.
     """
 
     kind: str
@@ -51,7 +50,6 @@ class Plan(Generic[T]):
     text: str
     work: Callable[[Stage], T]
     check: Callable[[], object]
-    units: int = 0
     seconds: Callable[[], float] | None = None
 
     @property

@@ -141,7 +141,7 @@ def plan_target(settings: TrainTargetSettings, database: Database) -> Plan[tuple
         f"{count(train.steps, 'step')} of {train.batch} samples{start}"
     )
     training = TargetTraining(settings, dataset, tasks, world, init, place)
-    return Plan("target", folder, text, training.work, place.check, train.steps, training.seconds)
+    return Plan("target", folder, text, training.work, place.check, training.seconds)
 
 
 def checked_demos(
