@@ -54,7 +54,7 @@ from kerv_cli.lab.work import (
     Started,
     work,
 )
-from kerv_cli.lab.workers import LocalWorkers, disturbances, gpus_in_turn, workers
+from kerv_cli.lab.workers import LocalWorkers, gpus_in_turn, workers
 from kerv_cli.report.report import further_of
 from kerv_cli.report.tables import load_study
 from kerv_cli.worlds import EnvironmentPart
@@ -192,7 +192,7 @@ def test_an_error_of_kerv_is_told_in_its_own_words(database):
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_study_that_is_deleted_while_it_runs_says_so(tmp_path, workers):
     def remove(event):
-        if isinstance(event, Counted) and sum(event.left.values()) < 16:
+        if isinstance(event, Counted) and event.left < 16:
             Study(opened(tmp_path), "threshold").remove()
 
     with pytest.raises(KervError, match="threshold was deleted"):
@@ -618,16 +618,14 @@ def test_estimates_say_what_they_rest_on(database, monkeypatch):
 
     assert (left(1).seconds, "guess" in left(1).source) == (32 * 10.0, True)
     store, _ = swept(database.results, threshold_study(["reach-v3"], radii=()))
-    wall = store.frame().groupby("label")["wall_seconds"].mean()
     estimate = left(2)
-    assert estimate.seconds == pytest.approx((4 * wall.sum() + 16 * wall.mean()) / 2)
+    assert estimate.seconds == pytest.approx(24 * store.frame()["wall_seconds"].mean() / 2)
     assert estimate.source == "measured on 8 stored episodes"
-    waits = {setting.work: 4 if number < 2 else 8 for number, setting in enumerate(TWO.settings)}
     began = time.monotonic()
     monkeypatch.setattr("time.monotonic", lambda: began + 6.0)
-    estimate.see(Counted(waits))
+    estimate.see(Counted(24))
     assert estimate.seconds == left(2).seconds, "nothing has ended"
-    estimate.see(Counted({work: number / 4 for work, number in waits.items()}))
+    estimate.see(Counted(6))
     assert estimate.seconds == pytest.approx(2.0, rel=0.1), "a quarter is left after 6 s"
 
 
@@ -728,21 +726,6 @@ def test_each_local_worker_sees_one_gpu(visible, device, seen, tmp_path, monkeyp
         until(lambda: sum(path.stat().st_size > 0 for path in tmp_path.glob("gpu*")) == 3)
     found = [path.read_text().strip() for path in tmp_path.glob("gpu*")]
     assert {one: found.count(one) for one in found} == seen
-
-
-def test_a_plan_warns_of_workers_that_disturb_each_others_times(tmp_path, monkeypatch):
-    database = opened(tmp_path)
-
-    def warnings(workers: int, device: str = "cpu", batch: int = 1) -> list[str]:
-        settings = settings_of("ar")
-        settings.runtime.device, settings.rollout.batch = device, batch
-        runtime = RuntimeSettings(workers=workers)
-        return disturbances(planned(database, study_of({"ar": settings}, ["reach-v3"]), runtime=runtime))
-
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
-    assert warnings(1) == warnings(2, "cuda") == warnings(2, batch=16) == []
-    assert "memory channel" in warnings(2)[0]
-    assert "3 workers measure times and share 2 GPUs" in warnings(3, "cuda")[0]
 
 
 def test_a_database_that_does_not_answer_is_asked_again_for_two_minutes(tmp_path, monkeypatch):

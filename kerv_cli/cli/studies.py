@@ -70,7 +70,6 @@ def print_settings(resolved: ResolvedStudy) -> None:
 def print_study_plan(planned: Plan, as_json: bool, guess: float = SECONDS_PER_EPISODE) -> None:
     """Print which episodes would run, why, and how long that would take. `guess`: seconds, if none was measured."""
     from kerv_cli.lab.follow import TimeLeft
-    from kerv_cli.lab.workers import disturbances
 
     rows, to_run, reused, study = _plan_rows(planned), planned.to_run, planned.existing, planned.study
     left = TimeLeft(planned, guess)
@@ -78,8 +77,6 @@ def print_study_plan(planned: Plan, as_json: bool, guess: float = SECONDS_PER_EP
         end_with_json({"study": study.name, "folder": study.root, "settings": rows, "to run": len(to_run),
                        "reused": len(reused), "seconds": left.seconds, "source": left.source})  # fmt: skip
     print_rows(rows, f"study {study.name}, episodes")
-    for warning in disturbances(planned):
-        typer.echo(f"kerv: warning: {warning}", err=True)
     typer.echo(f"{count(len(to_run), 'episode')} to run, {len(reused)} reused, {about(left.seconds, left.source)}")
 
 
@@ -137,7 +134,7 @@ def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None =
             if left is not None and total:
                 line = ", ".join(filter(None, (line, f"{total} to run", about(left.seconds, left.source))))
         elif isinstance(event, Counted):
-            ended = max(0, total - sum(event.left.values()))
+            ended = max(0, total - event.left)
         elif isinstance(event, BlockStarted):
             title = event.block.title
         elif isinstance(event, Preparing):

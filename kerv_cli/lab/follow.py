@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import sqlalchemy as sa
@@ -140,8 +139,8 @@ def follow(plan: Plan, record: Run, tend: Callable[[], object], prepare: Prepare
         nonlocal counted
         waiting, counted = patiently(_left, plan, queue.number), time.monotonic()
         on_event(Counted(waiting))
-        record.beat(max(0, len(plan.to_run) - sum(waiting.values())))
-        return sum(waiting.values())
+        record.beat(max(0, len(plan.to_run) - waiting))
+        return waiting
 
     def see(event: Event) -> None:
         on_event(event)
@@ -161,18 +160,15 @@ def follow(plan: Plan, record: Run, tend: Callable[[], object], prepare: Prepare
     return _outcome(plan, queue.number, time.perf_counter() - began)
 
 
-def _left(plan: Plan, number: int) -> Mapping[str, int]:
-    """Return the number of unfinished episodes of a plan, by the hash of their setting."""
+def _left(plan: Plan, number: int) -> int:
+    """Return the number of unfinished episodes of a plan. Labels of one result share its episodes."""
     study = plan.study
     seeds = [one.seed for one in study.episodes]
     mine = WANTED.c.task.in_(study.tasks), WANTED.c.seed.between(min(seeds, default=0), max(seeds, default=-1))
-    query = sa.select(SETTINGS.c.work, sa.func.count()).select_from(WANTED.join(SETTINGS))
+    query = sa.select(SETTINGS.c.work, WANTED.c.task, WANTED.c.seed).distinct().select_from(WANTED.join(SETTINGS))
     query = query.where(WANTED.c.study_id == number, UNFINISHED, *mine, SETTINGS.c.label.in_(study.labels))
-    left: dict[str, int] = {}
     with study.database.reading() as connection:
-        for work, rows in connection.execute(query.group_by(SETTINGS.c.id, SETTINGS.c.work)):
-            left[work] = max(rows, left.get(work, 0))  # labels of one result share its episodes
-    return left
+        return connection.scalar(sa.select(sa.func.count()).select_from(query.subquery())) or 0
 
 
 def _alive(plan: Plan, number: int) -> bool:
@@ -212,40 +208,25 @@ def _outcome(plan: Plan, number: int, seconds: float) -> Outcome:
 
 
 class TimeLeft:
-    """Estimates how long the missing episodes of a plan take.
-
-    At first an episode is expected to take the mean time of its setting's stored episodes. A setting without any gets
-    the average of the other settings' means. Then the estimate follows the pace of what has ended.
+    """Estimates how long the missing episodes of a plan take: at first from stored episodes, then from their pace.
 
     Args:
         plan: The plan.
-        guess: Seconds per episode while no episode is measured.
+        guess: Seconds per episode if none of the study's settings has a stored one.
     """
 
     def __init__(self, plan: Plan, guess: float) -> None:
-        self.workers = max(1, min(plan.runtime.workers, len(plan.blocks)))
-        waiting = Counter(one.setting.work for one in plan.to_run)
         works = {setting.work for setting in plan.study.settings}
-        query = sa.select(EPISODES.c.work, sa.func.avg(EPISODES.c.wall_seconds), sa.func.count(EPISODES.c.wall_seconds))
+        query = sa.select(sa.func.avg(EPISODES.c.wall_seconds), sa.func.count(EPISODES.c.wall_seconds))
         with plan.study.database.reading() as connection:
-            rows = connection.execute(query.where(EPISODES.c.work.in_(works)).group_by(EPISODES.c.work)).all()
-        stored = sum(number for _, _, number in rows)
-        means = {work: float(mean) for work, mean, _ in rows if mean is not None}
-        usual = sum(means.values()) / len(means) if means else guess
-        self._costs = {work: means.get(work, usual) for work in works}
-        self._total = self._cost(waiting)
-        self._began = time.monotonic()
-        self.seconds = self._total / self.workers
+            mean, stored = connection.execute(query.where(EPISODES.c.work.in_(works))).one()
+        self._total, self._began = len(plan.to_run), time.monotonic()
+        self.seconds = self._total * (mean or guess) / max(1, min(plan.runtime.workers, len(plan.blocks)))
         self.source = (
             f"measured on {count(stored, 'stored episode')}" if stored else f"a guess of {guess:g} s per episode"
         )
 
-    def _cost(self, waiting: Mapping[str, int]) -> float:
-        return sum(number * self._costs.get(work, 0.0) for work, number in waiting.items())
-
     def see(self, event: Event) -> None:
         """Correct the estimate by the number of episodes that are left."""
-        if isinstance(event, Counted):
-            rest = self._cost(event.left)
-            if rest < self._total:
-                self.seconds = (time.monotonic() - self._began) * rest / (self._total - rest)
+        if isinstance(event, Counted) and event.left < self._total:
+            self.seconds = (time.monotonic() - self._began) * event.left / (self._total - event.left)

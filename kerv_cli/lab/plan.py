@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import UsageError
@@ -95,14 +95,6 @@ class StoredEpisode:
 
 
 @dataclass(frozen=True)
-class KnownRow:
-    """What a study's row of an episode says: its stored episode, and whether other stored episodes do not count."""
-
-    episode_id: int | None
-    anew: bool
-
-
-@dataclass(frozen=True)
 class Block:
     """Episodes of one task, which one process runs. The settings take turns, seed by seed.
 
@@ -170,7 +162,7 @@ def split(
     episodes: Sequence[Episode],
     block: int,
     stored: Mapping[Key, Sequence[StoredEpisode]],
-    known: Mapping[Episode, KnownRow],
+    known: Mapping[Episode, Any],
     rerun: str = NEVER,
     earlier: Mapping[str, Setting] | None = None,
 ) -> tuple[dict[Episode, int], dict[Episode, str]]:
@@ -180,8 +172,8 @@ def split(
         episodes: The study's episodes.
         block: Number of seeds in a block, which one process runs.
         stored: Episodes in the database, by `Episode.key`.
-        known: Rows of the study that a database has already. A row keeps its episode. A row that ALL has emptied stays
-            empty until it has run.
+        known: Rows of the table WANTED that the study has already. A row keeps its episode. A row that ALL has emptied
+            stays empty until it has run.
         rerun: Which existing episodes to run again, NEVER or ALL.
         earlier: The newest stored setting by label. Used to explain what has changed.
 
@@ -191,34 +183,17 @@ def split(
     """
     usable: dict[Episode, list[StoredEpisode]] = {}
     for one in episodes:
-        row, rows = known.get(one, KnownRow(None, False)), list(stored.get(one.key, ()))
-        linked = [each for each in rows if each.id == row.episode_id]
-        usable[one] = [] if rerun == ALL or (row.anew and not linked) else linked or rows
+        row, rows = known.get(one), list(stored.get(one.key, ()))
+        linked = [each for each in rows if row is not None and each.id == row.episode_id]
+        is_anew = rerun == ALL or (row is not None and row.anew and not linked)
+        usable[one] = [] if is_anew else linked or rows
     _keep_whole_orders(usable, block)
-    existing: dict[Episode, int] = {}
-    for turn in grouped(episodes, lambda one: (one.task, one.seed)).values():
-        existing |= _rows_of_turn(turn, usable)
+    existing = {one: max(row.id for row in rows) for one, rows in usable.items() if rows}
     for part in ordered_parts(episodes, block):
         if not existing.keys() >= set(part):
             for one in part:
                 existing.pop(one, None)
     return existing, _reasons(episodes, stored, existing, rerun, earlier or {})
-
-
-def _rows_of_turn(turn: Sequence[Episode], usable: Mapping[Episode, Sequence[StoredEpisode]]) -> dict[Episode, int]:
-    """Choose one stored row for each episode of a turn: a task and a seed. Episodes without a row are left out.
-
-    If an episode has several rows, choose the row from the block that ran the most episodes of the turn. If several
-    blocks ran equally many, choose the newest row.
-    """
-    in_block: Counter[str] = Counter()
-    for one in turn:
-        in_block.update(map(attrgetter("block"), usable[one]))
-    found = {}
-    for one in turn:
-        if usable[one]:
-            found[one] = max(usable[one], key=lambda row: (in_block[row.block], row.started, row.id)).id
-    return found
 
 
 def _reasons(

@@ -21,7 +21,7 @@ from kerv_cli.episodes import policy
 from kerv_cli.episodes.identity import Setting
 from kerv_cli.episodes.resolve import ResolvedStudy, located
 from kerv_cli.lab.database import EPISODES, SETTINGS, STUDIES, UNFINISHED, WANTED, Database
-from kerv_cli.lab.plan import ALL, NEVER, Block, Episode, KnownRow, all_episodes, blocks_of, ordered_parts, split
+from kerv_cli.lab.plan import ALL, NEVER, Block, Episode, all_episodes, blocks_of, ordered_parts, split
 from kerv_cli.lab.presence import living
 from kerv_cli.lab.runs import interrupted, running
 from kerv_cli.lab.store import (
@@ -159,12 +159,12 @@ def plan_study(
         command: Command-line arguments (without `kerv`) that resume the study.
     """
     with study.database.reading() as connection:
-        known: dict[Episode, KnownRow] = {}
+        known: dict[Episode, Any] = {}
         of_label = {setting.label: setting for setting in study.settings}
         for row in rows_of(connection, study.name):
             setting = of_label.get(row.label)
             if setting is not None and setting.work == row.work:
-                known[Episode(setting, row.task, row.seed)] = KnownRow(row.episode_id, row.anew)
+                known[Episode(setting, row.task, row.seed)] = row
         stored = stored_episodes(connection, study.kind, {setting.work for setting in study.settings})
         earlier = _earlier(connection, study.labels)
     existing, missing = split(study.episodes, study.block, stored, known, rerun, earlier)

@@ -11,7 +11,7 @@ import os
 import secrets
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -97,9 +97,9 @@ class BlocksWait:
 
 @dataclass(frozen=True)
 class Counted:
-    """How many of a plan's episodes have neither ended nor failed, wherever they run: by the hash of their setting."""
+    """How many of a plan's episodes have neither ended nor failed, wherever they run."""
 
-    left: Mapping[str, int]
+    left: int
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,6 @@ from typing import IO, Any
 import sqlalchemy as sa
 
 from kerv_cli.base.config import as_overrides
-from kerv_cli.base.durations import count
 from kerv_cli.base.errors import KervError
 from kerv_cli.lab.command import STORE
 from kerv_cli.lab.database import PLANNED, STUDIES, UNFINISHED, WANTED, Database
@@ -63,21 +62,6 @@ def gpus_in_turn(device: str) -> list[str]:
     import torch
 
     return list(map(str, range(torch.cuda.device_count())))
-
-
-def disturbances(plan: Plan) -> list[str]:
-    """Return sentences about what will disturb the measured times: workers that share a GPU or the CPU's memory."""
-    number = plan.runtime.workers
-    if number < 2 or plan.is_elsewhere or all(block.batch > 1 for block in plan.blocks):
-        return []
-    gpus = len(gpus_in_turn(plan.device))
-    if plan.device != "cuda":
-        shared = "share this machine's memory: each needs a core and a memory channel of its own"
-    elif number > gpus:
-        shared = f"share {count(gpus, 'GPU')}"
-    else:
-        return []
-    return [f"{number} workers measure times and {shared} (docs/scale.md)"]
 
 
 @contextlib.contextmanager
