@@ -123,6 +123,6 @@ if __name__ == "__main__":
     parser.add_argument("settings", nargs="+")
     parser.add_argument("--results", type=Path, default=Path("results"))
     given = parser.parse_args()
-    study = Study(opened(given.results), given.study)
+    study = Study(opened(given.results), given.study).load()
     given.out.write_bytes(make_film([read_panel(study, name, given.task, given.seed) for name in given.settings]))
     print(f"{given.out}: {given.out.stat().st_size // 1000} kB")

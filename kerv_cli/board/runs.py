@@ -123,7 +123,7 @@ def show_study(request: Request, version: str, is_live: bool) -> Response:
 
 def show_tables(request: Request) -> Response:
     database, name = database_of(request), request.path_params["name"]
-    store = Study(database, name)
+    store = Study(database, name).load(episodes=False)
     is_running = RUNNING in map(attrgetter("status"), run_rows(database, store.kind, name))
     version = f"{store.version()}/{is_running}"
     if request.query_params.get("known") == version:

@@ -67,7 +67,7 @@ class Study:
     Attributes:
         database: The database.
         name: Name in the database.
-        kind: sweep, rollout or import. If left out, it is read from the database, or sweep if the study is not stored.
+        kind: sweep, rollout or import.
         settings: The settings to compare.
         episodes: All episodes, in the order in which they run.
         title: Title of the report.
@@ -83,7 +83,7 @@ class Study:
 
     database: Database
     name: str
-    kind: str = ""
+    kind: str = SWEEP
     settings: tuple[Setting, ...] = ()
     episodes: tuple[Episode, ...] = ()
     title: str = ""
@@ -95,9 +95,6 @@ class Study:
 
     def __post_init__(self) -> None:
         check_name(self.name, "study name")
-        if not self.kind:
-            row = self._row()
-            object.__setattr__(self, "kind", SWEEP if row is None else row.kind)
 
     @property
     def labels(self) -> list[str]:
@@ -245,7 +242,10 @@ class Study:
             if not parts:
                 return pd.DataFrame()
             frame = pd.concat(parts, ignore_index=True)
-            about = self._about_blocks(connection, frame["block"].unique().tolist())
+            works = sa.select(SETTINGS.c.work).join(STUDIES).where(STUDIES.c.name == self.name)
+            ran = sa.select(EPISODES.c.block).where(EPISODES.c.work.in_(works))
+            blocks = sa.select(BLOCKS.c.id, BLOCKS.c.about).where(BLOCKS.c.id.in_(ran))
+            about = {row.id: row.about for row in connection.execute(blocks)}
             numbers = [column.name for column in MEASURES if isinstance(column.type, sa.Double | sa.BigInteger)]
             frame[numbers] = frame[numbers].apply(pd.to_numeric)
             unknown = frame[numbers].isna().all()
@@ -256,16 +256,6 @@ class Study:
             chosen = [(one.setting.label, one.task, one.seed) for one in episodes]
             frame = frame[pd.MultiIndex.from_frame(frame[["label", "task", "seed"]]).isin(chosen)]
         return frame.join(pd.DataFrame.from_dict(about, orient="index"), on="block").reset_index(drop=True)
-
-    def _about_blocks(self, connection: sa.Connection, blocks: Sequence[str]) -> dict[str, Any]:
-        """Return machine and versions of each block, by the block's id."""
-        about: dict[str, Any] = {}
-        for first in range(0, len(blocks), _AT_ONCE):
-            some = BLOCKS.c.id.in_(blocks[first : first + _AT_ONCE])
-            about |= {
-                row.id: row.about for row in connection.execute(sa.select(BLOCKS.c.id, BLOCKS.c.about).where(some))
-            }
-        return about
 
     def decodes(self, episodes: Sequence[int], columns: Sequence[str] | None = None) -> pa.Table:
         """Return the decodes of several episodes in one table. Its column `episode` is an index into `episodes`.
@@ -281,10 +271,9 @@ class Study:
         blobs: dict[int, bytes] = {}
         with self.database.reading() as connection:
             for first in range(0, len(episodes), _AT_ONCE):
-                part = map(int, episodes[first : first + _AT_ONCE])
-                found = sa.select(DECODES.c.episode_id, DECODES.c.parquet).where(DECODES.c.episode_id.in_(list(part)))
-                for row in connection.execute(found):
-                    blobs[row.episode_id] = row.parquet
+                part = list(map(int, episodes[first : first + _AT_ONCE]))
+                found = sa.select(DECODES.c.episode_id, DECODES.c.parquet).where(DECODES.c.episode_id.in_(part))
+                blobs |= dict(connection.execute(found).all())
         tables = []
         with self.database.checking(f"decodes of {self.name}"):
             for index, number in enumerate(episodes):

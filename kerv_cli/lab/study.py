@@ -35,8 +35,6 @@ from kerv_cli.lab.store import (
     study_row,
 )
 
-_AT_ONCE = 500  # most values in one SQL IN (…)
-
 
 @dataclass(frozen=True, eq=False)
 class Plan:
@@ -205,20 +203,21 @@ def save_in(connection: sa.Connection, plan: Plan, run: str = "") -> int:
     number, is_same_baseline = study_row(connection, study)
     ids = save_settings(connection, study, number, is_shared, is_same_baseline)
     before = {(row.setting_id, row.task, row.seed): row for row in rows_of(connection, study.name)}
-    vanished = _vanished(connection, plan.existing.values())
+    works = {setting.work for setting in study.settings}
+    stored = set(connection.scalars(sa.select(EPISODES.c.id).where(EPISODES.c.work.in_(works))))
     wanted = {(ids[one.setting.label], one.task, one.seed): one for one in study.episodes}
-    positions = _positions(wanted, before)
     new, changed, moved = list[Any](), list[Any](), list[Any]()
     to_run = dict[Episode, dict[str, Any]]()
+    positions = _positions(wanted, before)
     for key, one in wanted.items():
         row, linked = before.pop(key, None), plan.existing.get(one)
         of_key = dict(zip(_KEY, key, strict=True))
         if row is not None and _stays(row, linked, plan, is_shared):
             if row.position != positions[key]:
-                moved.append({"of_" + name: value for name, value in (of_key | {"position": positions[key]}).items()})
+                moved.append({f"of_{name}": value for name, value in (of_key | {"position": positions[key]}).items()})
             continue
         values = {**of_key, "study_id": number, "position": positions[key], "error": None, "block": None,
-                  "episode_id": None if linked in vanished else linked, "worker": None, "attempts": 0,
+                  "episode_id": linked if linked in stored else None, "worker": None, "attempts": 0,
                   "anew": plan.anew or (row is not None and row.anew)}  # fmt: skip
         if values["episode_id"] is None:
             to_run[one] = values
@@ -276,16 +275,6 @@ def _somebody_runs(connection: sa.Connection, study: Study, run: str) -> bool:
     mine = WANTED.join(STUDIES, WANTED.c.study_id == STUDIES.c.id)
     claimed = sa.select(WANTED.c.worker).distinct().select_from(mine).where(STUDIES.c.name == study.name, UNFINISHED)
     return bool(living(study.database, connection).keys() & set(connection.scalars(claimed)))
-
-
-def _vanished(connection: sa.Connection, numbers: Iterable[int]) -> set[int]:
-    """Return those row numbers of episodes that were removed since the study was planned."""
-    wanted = sorted(set(numbers))
-    there: set[int] = set()
-    for first in range(0, len(wanted), _AT_ONCE):
-        part = wanted[first : first + _AT_ONCE]
-        there.update(connection.scalars(sa.select(EPISODES.c.id).where(EPISODES.c.id.in_(part))))
-    return set(wanted) - there
 
 
 def _check_orders(study: Study, to_run: Mapping[Episode, object], is_shared: bool) -> None:
