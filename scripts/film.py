@@ -19,6 +19,7 @@ from PIL import Image, ImageDraw, ImageFont
 from kerv_cli.board.episode import record_episode
 from kerv_cli.catalogue.episodes import find_episode, outcomes
 from kerv_cli.lab.database import opened
+from kerv_cli.lab.read import loaded
 from kerv_cli.lab.store import Study
 from kerv_cli.report.viewing.token_outcomes import OUTCOMES, TokenOutcome, chunk_size, outcomes_of
 from kerv_cli.report.viewing.viewer import film_of
@@ -123,6 +124,6 @@ if __name__ == "__main__":
     parser.add_argument("settings", nargs="+")
     parser.add_argument("--results", type=Path, default=Path("results"))
     given = parser.parse_args()
-    study = Study(opened(given.results), given.study).load()
+    study = loaded(Study(opened(given.results), given.study))
     given.out.write_bytes(make_film([read_panel(study, name, given.task, given.seed) for name in given.settings]))
     print(f"{given.out}: {given.out.stat().st_size // 1000} kB")

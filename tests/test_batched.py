@@ -29,6 +29,7 @@ from kerv_cli.episodes.cost import Profile
 from kerv_cli.episodes.identity import Setting
 from kerv_cli.episodes.runner import Request, run_together
 from kerv_cli.lab.plan import Episode, blocks_of
+from kerv_cli.lab.read import frame_of
 from kerv_cli.lab.store import Study
 from kerv_cli.lab.work import EpisodeRunner, RunEpisode
 from kerv_cli.methods.early import EarlySettings
@@ -284,7 +285,7 @@ def test_a_batch_is_another_setting_and_has_no_times(tmp_path):
     swept(tmp_path, ar_study("reach-v3"), prepared)
     store, outcome = swept(tmp_path, ar_study(), prepared)
     assert (len(outcome.reused), len(outcome.done), prepared.groups) == (7, 14, [7, 14])
-    episodes = store.frame()
+    episodes = frame_of(store)
     assert (episodes["wall_seconds"] > 0).all()
     assert episodes["seconds"].isna().all()
     assert episodes["seconds.prefill"].isna().all()

@@ -21,6 +21,7 @@ from kerv_cli.board import runs
 from kerv_cli.board.app import make_app
 from kerv_cli.episodes.rows import episode_row, seconds_blob
 from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, SETTINGS, WANTED, now, opened
+from kerv_cli.lab.read import counts_of
 from kerv_cli.lab.runs import Run
 from kerv_cli.lab.store import Study
 from kerv_cli.lab.study import save
@@ -274,7 +275,7 @@ def test_a_running_sweep_is_watched_until_it_ends(tmp_path, open_page, monkeypat
         page = open_page(address)
         assert "Nothing here yet" in page.locator("main").inner_text()
         sweep.start()
-        while not Study(opened(tmp_path), "live").counts()[0]:
+        while not counts_of(Study(opened(tmp_path), "live"))[0]:
             time.sleep(0.05)
         page.reload()
         page.locator(".pill", has_text=re.compile(r"running, \d+ of 24")).wait_for()

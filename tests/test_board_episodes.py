@@ -31,7 +31,8 @@ from kerv_cli.episodes.resolve import resolve_rollout
 from kerv_cli.episodes.rows import decode_records, decodes_table
 from kerv_cli.episodes.runner import Runner, close_worlds
 from kerv_cli.lab.database import WANTED, Database, opened
-from kerv_cli.lab.store import studies
+from kerv_cli.lab.read import frame_of, studies
+from kerv_cli.lab.store import remove_study
 from kerv_cli.report.viewing.token_outcomes import outcomes_of, tokens_hash
 
 expect.set_options(timeout=120_000)
@@ -164,20 +165,20 @@ def test_the_command_on_the_page_repeats_the_episode(rolled):
     newest = studies(rolled)[0]
     try:
         assert newest.kind == "rollout"
-        again = newest.frame()["episode"].item()
+        again = frame_of(newest)["episode"].item()
         assert again not in numbers
         assert tokens_hash(find_episode(rolled, again).decodes()[0]) == tokens_hash(
             find_episode(rolled, numbers[1]).decodes()[0]
         )
     finally:
-        newest.remove()
+        remove_study(newest)
 
 
 def test_settings_that_adapt_are_repeated_with_the_episodes_before(tmp_path):
     typed = ("method=spec_vla", "skip=similarity", "skip.up=0.01", "episodes=4")
     adapting = resolve_rollout([*typed, "task=reach-v3"], multirun=False).first
     store, _ = swept(tmp_path, study_of({"ar": settings_of("ar"), "spec_vla": adapting}, ["reach-v3"]))
-    numbers = store.frame().set_index(["label", "seed"])["episode"].to_dict()
+    numbers = frame_of(store).set_index(["label", "seed"])["episode"].to_dict()
     last, plain = (find_episode(store.database, numbers[label, 100_003]) for label in ("spec_vla", "ar"))
     assert (last.earlier, plain.earlier) == ((100_000, 100_001, 100_002), ())
     episode = replace(last.episode, setting=replace(last.episode.setting, overrides=typed))

@@ -22,6 +22,7 @@ from kerv_cli.episodes.interface import read_interface
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import opened
+from kerv_cli.lab.read import how_to_run
 from kerv_cli.lab.store import Study
 from kerv_cli.methods.compose import Method
 from kerv_cli.training.preparation import needs
@@ -233,7 +234,7 @@ def test_advice_names_a_study_by_its_file_and_another_file_does_not_replace_it(t
     words, where = ("sweep", "study=abl.yaml"), f"results={here / 'results'}"
     assert "1 run, 0 reused, 0 failed" in told(*words)
     monkeypatch.chdir(there)
-    advice = Study(opened(here / "results"), "mine").how_to_run()
+    advice = how_to_run(Study(opened(here / "results"), "mine"))
     assert advice == f"run `kerv sweep study={here}/abl.yaml {where}`"
     assert f"study={there}/abl.yaml would replace study 'mine' of {here}/abl.yaml" in refusal(*words, where)
     assert "1 run, 0 reused, 0 failed" in told(*words, where, "study.name=other")

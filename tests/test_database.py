@@ -23,8 +23,9 @@ from kerv_cli.episodes.rows import decodes_table, episode_row
 from kerv_cli.lab import database as module
 from kerv_cli.lab.command import STORE, noted, without_passwords
 from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, FILE, RUNS, STUDIES, WANTED, Database, Unanswered, opened
+from kerv_cli.lab.read import counts_of, decodes_of, frame_of, loaded, studies, version_of
 from kerv_cli.lab.runs import Run, making, pulse, run_rows, time_left
-from kerv_cli.lab.store import Study, studies
+from kerv_cli.lab.store import Study, remove_study
 from kerv_cli.training.demonstrations import open_demos
 
 STUDY = threshold_study(["reach-v3"])
@@ -67,7 +68,7 @@ def damageable(tmp_path_factory):
 
 def test_reading_creates_nothing(database, tmp_path):
     assert studies(database) == run_rows(database) == []
-    assert Study(opened(tmp_path), "threshold").counts() == (0, 0)
+    assert counts_of(Study(opened(tmp_path), "threshold")) == (0, 0)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -78,15 +79,15 @@ def test_an_episode_comes_back_as_it_was(database):
     odd = dataclasses.replace(decodes[0], deviation=0.125, similarity=0.5, compensated=3, skipped=True)
     records[100_000] = dataclasses.replace(records[100_000], decodes=(odd, *decodes[1:]))
     store, _ = swept(database.results, study_of({"ar": settings_of("ar")}, ["reach-v3"]), lambda *_: records.get)
-    frame = store.frame()
+    frame = frame_of(store)
     assert list(frame["seed"]) == list(records)
     for row, record in zip(frame.to_dict("records"), records.values(), strict=True):
         stored = row | {"initial_state": list(row["initial_state"])}
         assert {name: stored[name] for name in episode_row(record)} == episode_row(record)
         assert list(row["decode_seconds"]) == [decode.seconds for decode in record.decodes]
         assert row["device_name"]
-        assert store.decodes([row["episode"]]).drop_columns("episode").equals(decodes_table(record))
-    assert store.load().settings[0].settings == study_of({"ar": settings_of("ar")}, ["reach-v3"]).settings[0].settings
+        assert decodes_of(store, [row["episode"]]).drop_columns("episode").equals(decodes_table(record))
+    assert loaded(store).settings[0].settings == study_of({"ar": settings_of("ar")}, ["reach-v3"]).settings[0].settings
 
 
 def test_what_is_no_number_is_stored_as_unknown(database):
@@ -96,7 +97,7 @@ def test_what_is_no_number_is_stored_as_unknown(database):
 
     store, outcome = swept(database.results, study_of({"ar": settings_of("ar")}, ["reach-v3"]), lambda *_: run)
     assert len(outcome.done) == 4
-    assert store.frame()["deviation_sum"].isna().all()
+    assert frame_of(store)["deviation_sum"].isna().all()
 
 
 def test_a_failed_transaction_leaves_nothing(database):
@@ -177,7 +178,7 @@ def test_a_damaged_file_is_one_line(tmp_path, harm):
         return
     remedy = () if harm == "a folder" else ("is damaged", "restore a copy of it, or move it aside")
     with refused(str(path), *remedy):
-        Study(opened(tmp_path), "threshold").frame()
+        frame_of(Study(opened(tmp_path), "threshold"))
     result = kerv("runs", "list", f"results={tmp_path}", code=None)
     assert result.exit_code in (0, 1)
     assert "Traceback" not in result.output
@@ -196,7 +197,7 @@ def test_an_error_text_and_a_state_that_databases_refuse_are_stored(database):
 
     store, outcome = swept(database.results, study, run)
     assert [len(failure.episodes) for failure in outcome.failed] == [4]
-    assert store.frame()["initial_state"].tolist() == [(None, None, 1.5)] * 4
+    assert frame_of(store)["initial_state"].tolist() == [(None, None, 1.5)] * 4
     with database.reading() as connection:
         errors = set(connection.scalars(sa.select(WANTED.c.error).where(WANTED.c.error.is_not(None))))
     assert all(r"a\x00b \udc80" in error for error in errors)
@@ -290,16 +291,16 @@ def test_a_full_disk_keeps_what_was_committed(tmp_path, monkeypatch):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     store = Study(opened(tmp_path), "threshold")
-    assert store.counts() == (8, 40)
-    assert len(store.frame()) == 8
+    assert counts_of(store) == (8, 40)
+    assert len(frame_of(store)) == 8
     monkeypatch.setattr("kerv_cli.lab.presence.LAPSE_SECONDS", 1.0)
     swept(tmp_path, study)  # in this process, whose claim could not be released
-    assert store.counts() == (40, 40)
+    assert counts_of(store) == (40, 40)
 
 
 def test_a_study_that_is_not_there_names_what_to_run(database, tmp_path):
     with refused("no study 'threshold'", "run `kerv sweep study=threshold", error=UsageError):
-        Study(opened(tmp_path), "threshold").load()
+        loaded(Study(opened(tmp_path), "threshold"))
     for name in ("../up", "a/b", "", ".hidden"):
         with pytest.raises(UsageError, match="study name"):
             Study(opened(tmp_path), name)
@@ -309,11 +310,11 @@ def test_a_removed_study_leaves_nothing_but_what_others_want(database):
     store, _ = swept(database.results, STUDY)
     other, _ = swept(database.results, threshold_study(["reach-v3"], radii=(3,), name="other"))
     swept(database.results, STUDY, rerun="all")  # the replaced episodes are the study's, too
-    store.remove()
+    remove_study(store)
     assert [one.name for one in studies(database)] == ["other"]
     assert (count(database, EPISODES), count(database, DECODES)) == (12, 12)
-    assert other.counts() == (12, 12)
-    other.remove()
+    assert counts_of(other) == (12, 12)
+    remove_study(other)
     assert [count(database, table) for table in (EPISODES, DECODES, BLOCKS, STUDIES)] == [0] * 4
 
 
@@ -351,9 +352,9 @@ def test_one_query_says_whether_anything_has_changed(database):
     assert [is_live for _, is_live in seen] == [False, True, True, False, False]
     assert len({version for version, _ in seen}) == len(seen)
     assert pulse(database) == seen[-1]
-    before = store.version()
+    before = version_of(store)
     swept(database.results, STUDY, rerun="all")
-    assert store.version() != before
+    assert version_of(store) != before
 
 
 # --- rows of what was begun, and which database holds them

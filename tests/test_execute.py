@@ -42,7 +42,8 @@ from kerv_cli.lab.follow import TimeLeft, begun
 from kerv_cli.lab.plan import blocks_of
 from kerv_cli.lab.presence import Presence
 from kerv_cli.lab.queue import MOST_DEATHS, ClaimLost, Queue
-from kerv_cli.lab.store import Study
+from kerv_cli.lab.read import counts_of, frame_of
+from kerv_cli.lab.store import Study, remove_study
 from kerv_cli.lab.study import save
 from kerv_cli.lab.work import (
     BlockStarted,
@@ -132,7 +133,7 @@ def test_the_settings_of_a_block_take_turns_in_a_recorded_order(database):
     store, _ = swept(database.results, study, noting)
     turns = [one for block in blocks_of(study.episodes, study.block) for one in block.turns()]
     assert ran == [(one.setting.label, one.seed) for one in turns]
-    table = store.frame().sort_values(["started", "order"])
+    table = frame_of(store).sort_values(["started", "order"])
     assert list(zip(table["label"], table["seed"], strict=True)) == ran
     assert list(table["order"]) == [*range(20), *range(8)]
     assert table["block"].nunique() == 2
@@ -147,15 +148,15 @@ def test_each_episode_is_committed_when_it_ends(database):
 
     def on_event(event):
         if isinstance(event, EpisodeEnd):
-            told.append(Study(opened(database.results), "threshold").counts())
+            told.append(counts_of(Study(opened(database.results), "threshold")))
 
     store, _ = swept(database.results, STUDY, on_event=on_event)
     assert told == [(number, 16) for number in range(1, 17)]
     with pytest.raises(Interrupted, match="of 32 episodes of threshold are kept: run the same command to resume"):
         swept(database.results, TWO, raising(KeyboardInterrupt(), "ar", [100_002]))
-    assert store.counts()[0] in range(24, 28)  # two seeds of four settings, and some of the third
+    assert counts_of(store)[0] in range(24, 28)  # two seeds of four settings, and some of the third
     assert queued(database) == 0
-    there = store.counts()[0]
+    there = counts_of(store)[0]
     _, outcome = swept(database.results, TWO)
     assert (len(outcome.reused), len(outcome.done)) == (there, 32 - there)
 
@@ -175,7 +176,7 @@ def test_a_setting_that_raises_is_dropped_from_its_block_alone(database):
     assert [one.key for one in event.episodes] == [one.key for one in failure.episodes]
     _, outcome = swept(database.results, STUDY)
     assert (len(outcome.done), outcome.failed, errors(database)) == (2, [], [])
-    assert store.counts() == (16, 16)
+    assert counts_of(store) == (16, 16)
 
 
 def test_an_error_of_kerv_is_told_in_its_own_words(database):
@@ -193,12 +194,12 @@ def test_an_error_of_kerv_is_told_in_its_own_words(database):
 def test_a_study_that_is_deleted_while_it_runs_says_so(tmp_path, workers):
     def remove(event):
         if isinstance(event, Counted) and event.left < 16:
-            Study(opened(tmp_path), "threshold").remove()
+            remove_study(Study(opened(tmp_path), "threshold"))
 
     with pytest.raises(KervError, match="threshold was deleted"):
         swept(tmp_path, STUDY, unhurried, runtime=RuntimeSettings(workers=workers), on_event=remove)
     store, outcome = swept(tmp_path, STUDY)
-    assert (outcome.failed, store.counts(), queued(store.database)) == ([], (16, 16), 0)
+    assert (outcome.failed, counts_of(store), queued(store.database)) == ([], (16, 16), 0)
 
 
 def test_a_study_removed_elsewhere_takes_no_episode_away(database):
@@ -207,15 +208,15 @@ def test_a_study_removed_elsewhere_takes_no_episode_away(database):
     swept(database.results, other)
     plan = planned(database, STUDY)
     assert not plan.missing
-    Study(database, "other").remove()
+    remove_study(Study(database, "other"))
     save(plan)
     ran(plan.study)
-    assert (plan.study.counts(), errors(database)) == ((16, 16), [])
+    assert (counts_of(plan.study), errors(database)) == ((16, 16), [])
     swept(database.results, other)
 
     def remove(event):
         if isinstance(event, EpisodeEnd):
-            Study(database, "other").remove()
+            remove_study(Study(database, "other"))
 
     _, outcome = swept(database.results, TWO, on_event=remove)
     assert (len(outcome.done), len(outcome.reused), outcome.failed) == (16, 16, [])
@@ -225,10 +226,10 @@ def test_a_row_number_is_never_given_again(database):
     """A plan that links to episodes of a study that is removed finds none of another's in their place."""
     swept(database.results, STUDY)
     plan = planned(database, STUDY)
-    Study(database, "threshold").remove()
+    remove_study(Study(database, "threshold"))
     swept(database.results, study_of({"ar": settings_of("ar"), "late": settings_of("jacobi")}, ["push-v3"], "another"))
     save(plan)
-    assert (plan.study.counts(), Study(database, "another").counts()) == ((0, 16), (8, 8))
+    assert (counts_of(plan.study), counts_of(Study(database, "another"))) == ((0, 16), (8, 8))
 
 
 @pytest.mark.parametrize("others", [
@@ -243,7 +244,7 @@ def test_a_second_sweep_while_one_runs_takes_nothing_away(others, database):
         def on_event(event):
             if isinstance(event, EpisodeEnd) and not both:
                 both.append(pool.submit(swept, database.results, others))
-                until(lambda: Study(database, "threshold").counts()[1] >= len(others.episodes))
+                until(lambda: counts_of(Study(database, "threshold"))[1] >= len(others.episodes))
                 time.sleep(0.2)
 
         store, one = swept(database.results, STUDY, on_event=on_event)
@@ -252,7 +253,7 @@ def test_a_second_sweep_while_one_runs_takes_nothing_away(others, database):
         assert outcome.failed == []
         assert len(outcome.done) + len(outcome.reused) == len(study.episodes)
     keys = {(each.setting.label, each.task, each.seed) for each in (*STUDY.episodes, *others.episodes)}
-    assert store.counts() == (len(keys), len(keys))
+    assert counts_of(store) == (len(keys), len(keys))
     assert (episodes(database), queued(database)) == (len(keys), 0)
 
 
@@ -265,26 +266,26 @@ def test_other_settings_under_a_label_are_refused_while_the_study_runs(database)
                 swept(database.results, changed)
 
     store, _ = swept(database.results, STUDY, on_event=on_event)
-    assert store.counts() == (16, 16)
+    assert counts_of(store) == (16, 16)
     assert swept(database.results, changed)[1].failed == []
-    assert store.counts() == (8, 8)
+    assert counts_of(store) == (8, 8)
 
 
 def test_a_rerun_that_is_killed_is_resumed_without_rerun(database):
     """What it has run is kept, and stored episodes do not come back."""
     swept(database.results, STUDY)
-    first = set(Study(database, "threshold").frame()["episode"])
+    first = set(frame_of(Study(database, "threshold"))["episode"])
     with python(SWEEP, database.results, "killed_at_the_third", 1, 1, "all", "reach-v3") as process:
         process.join(60)
         assert process.exitcode == -signal.SIGKILL
     store = Study(database, "threshold")
-    there = store.counts()[0]
+    there = counts_of(store)[0]
     assert 0 < there < 16
     plan = planned(database, STUDY)
     assert (len(plan.existing), set(plan.missing.values())) == (there, {"rerun=all"})
     _, outcome = swept(database.results, STUDY)
     assert (len(outcome.done), len(outcome.reused)) == (16 - there, there)
-    assert first.isdisjoint(store.frame()["episode"])
+    assert first.isdisjoint(frame_of(store)["episode"])
 
 
 SWEEP = """
@@ -309,13 +310,13 @@ def test_workers_of_a_killed_sweep_end_and_the_next_one_begins_at_once(tmp_path)
     """Its lock is free: nobody waits for its heartbeat to lapse."""
     store = Study(opened(tmp_path), "threshold")
     with python(SWEEP, tmp_path, "slow_elsewhere", 2, 1, "never") as process:  # the second task takes a minute
-        until(lambda: store.counts()[0] == 6, 120.0)
+        until(lambda: counts_of(store)[0] == 6, 120.0)
         until(lambda: running(store.database))
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
         assert children
         process.kill()
     until(lambda: not any(Path(f"/proc/{child}").exists() for child in children), 5.0)
-    assert (store.counts(), queued(store.database)) == ((6, 12), 6)
+    assert (counts_of(store), queued(store.database)) == ((6, 12), 6)
     began = time.monotonic()
     _, outcome = swept(tmp_path, threshold_study(["reach-v3", "push-v3"], episodes=2, radii=(3,)))
     assert time.monotonic() - began < 20.0
@@ -334,7 +335,7 @@ def test_an_episode_takes_one_transaction(tmp_path, monkeypatch):
             assert (tmp_path / "kerv.db-wal").exists()
 
     ran(store, episodes_of, on_event)
-    assert store.counts() == (16, 16)
+    assert counts_of(store) == (16, 16)
     # the worker comes and goes; two claims; four settings are prepared, and the first episode begins
     assert len(begun) <= 16 + 2 + 2 + 4 + 1
 
@@ -348,7 +349,7 @@ def test_a_worker_that_was_silent_keeps_its_block_if_nobody_took_it(database):
             silence(database)
 
     ran(store, episodes_of, lapse)
-    assert (store.counts(), queued(database), episodes(database), len(ended)) == ((16, 16), 0, 16, 16)
+    assert (counts_of(store), queued(database), episodes(database), len(ended)) == ((16, 16), 0, 16, 16)
 
 
 @pytest.mark.parametrize(("silent", "is_held"), [(25.0, True), (35.0, False)])
@@ -385,7 +386,7 @@ def test_a_worker_that_was_silent_did_not_die_in_its_episode(database, present, 
             work(Queue(store, here.worker), taken, is_done=lambda number=number: len(late) == number)
         silence(database)
     ran(store)
-    assert (errors(database), store.counts()) == ([], (16, 16))
+    assert (errors(database), counts_of(store)) == ([], (16, 16))
 
 
 def test_no_two_workers_run_an_episode_that_two_studies_share(database, present):
@@ -401,7 +402,7 @@ def test_no_two_workers_run_an_episode_that_two_studies_share(database, present)
     ran(one)
     again = present(other).claim()
     assert again is not None
-    assert (again.block.episodes, other.counts()) == ((), (12, 24))
+    assert (again.block.episodes, counts_of(other)) == ((), (12, 24))
 
 
 STOPS = """
@@ -424,17 +425,17 @@ def test_a_worker_that_was_stopped_writes_nothing_twice(database, monkeypatch, i
     with python(STOPS, database.results) as process:
         until(lambda: running(database) == [100_002])
         until(lambda: Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[0] == "T")
-        there = store.counts()[0]
+        there = counts_of(store)[0]
         assert 0 < there < 16
         if is_taken:
             ran(store)
-            assert (store.counts(), queued(database)) == ((16, 16), 0)
+            assert (counts_of(store), queued(database)) == ((16, 16), 0)
         else:
             time.sleep(1.5)
         os.kill(process.pid, signal.SIGCONT)
         process.join(30)
         assert process.exitcode == 0
-    assert (episodes(database), store.counts(), queued(database)) == (16, (16, 16), 0)
+    assert (episodes(database), counts_of(store), queued(database)) == (16, (16, 16), 0)
 
 
 CREW = """
@@ -500,7 +501,7 @@ def test_any_number_of_workers_run_each_episode_once_though_some_are_killed(data
     assert (episodes(database), queued(database), errors(database)) == (9 * 10, 0, [])
     for number in (1, 2, 4):
         for block in (1, 2, 5):
-            assert Study(database, f"s{number}{block}").counts() == (10, 10)
+            assert counts_of(Study(database, f"s{number}{block}")) == (10, 10)
 
 
 AT_ONCE = """
@@ -516,7 +517,7 @@ def test_two_sweeps_and_three_workers_at_once_run_each_episode_once(database):
         process.join(60)
         assert process.exitcode == 0
     assert (episodes(database), queued(database)) == (24, 0)
-    assert Study(database, "threshold").counts() == (24, 24)
+    assert counts_of(Study(database, "threshold")) == (24, 24)
 
 
 def test_sweeps_at_once_run_each_episode_once(database):
@@ -524,7 +525,7 @@ def test_sweeps_at_once_run_each_episode_once(database):
         process.join(60)
         assert process.exitcode == 0
     assert episodes(database) == 12
-    assert Study(database, "threshold").counts() == (12, 12)
+    assert counts_of(Study(database, "threshold")) == (12, 12)
     assert queued(database) == 0
 
 
@@ -605,9 +606,9 @@ def test_episodes_whose_order_counts_run_whole_again_when_their_process_dies(dat
         process.join(60)
         assert process.exitcode == 0
     store = Study(database, "threshold")
-    assert store.counts() == (2 + 4, 8)
+    assert counts_of(store) == (2 + 4, 8)
     assert errors(database) == ["3 workers died in this episode\n"] * 2
-    frame = store.frame().query("label == 'heisd'")
+    frame = frame_of(store).query("label == 'heisd'")
     assert (len(frame), frame["block"].nunique()) == (4, 1)
     assert {one.setting.label for one in planned(database, in_order()).missing} == {"ar"}
 
@@ -619,7 +620,7 @@ def test_estimates_say_what_they_rest_on(database, monkeypatch):
     assert (left(1).seconds, "guess" in left(1).source) == (32 * 10.0, True)
     store, _ = swept(database.results, threshold_study(["reach-v3"], radii=()))
     estimate = left(2)
-    assert estimate.seconds == pytest.approx(24 * store.frame()["wall_seconds"].mean() / 2)
+    assert estimate.seconds == pytest.approx(24 * frame_of(store)["wall_seconds"].mean() / 2)
     assert estimate.source == "measured on 8 stored episodes"
     began = time.monotonic()
     monkeypatch.setattr("time.monotonic", lambda: began + 6.0)
@@ -688,7 +689,7 @@ def test_only_the_guilty_settings_fail(tmp_path):
     assert sum(len(failure.episodes) for failure in outcome.failed) == 3
     done = 3 * 2 + 1
     assert len(outcome.done) == done
-    table = store.frame()
+    table = frame_of(store)
     assert set(table["workers"]) == {2}
     assert table["run"].nunique() == 1
     assert set(table["wall_seconds"]) == {3.0}  # OMP_NUM_THREADS
@@ -736,7 +737,7 @@ def test_a_database_that_does_not_answer_is_asked_again_for_two_minutes(tmp_path
 
     def lock(event: object) -> None:
         """Lock the file after the fourth and the eighth episode."""
-        if isinstance(event, EpisodeEnd) and store.counts()[0] in (4, 8):
+        if isinstance(event, EpisodeEnd) and counts_of(store)[0] in (4, 8):
             locks.append(sqlite3.connect(tmp_path / "kerv.db", check_same_thread=False))
             locks[-1].execute("BEGIN IMMEDIATE")
             if len(locks) > 1:
@@ -746,11 +747,11 @@ def test_a_database_that_does_not_answer_is_asked_again_for_two_minutes(tmp_path
     with refused("locked", "finished episodes are kept", error=StorageError):
         ran(store, episodes_of, lock)
     locks[-1].close()
-    assert store.counts() == (4, 16)
+    assert counts_of(store) == (4, 16)
     monkeypatch.setattr("kerv_cli.lab.queue.PATIENCE_SECONDS", 20.0)
     silence(store.database)  # the block could not be freed
     ran(store, episodes_of, lock)
-    assert (len(locks), store.counts(), episodes(store.database)) == (2, (16, 16), 16)
+    assert (len(locks), counts_of(store), episodes(store.database)) == (2, (16, 16), 16)
 
 
 @pytest.mark.parametrize(("override", "says"), [
@@ -768,7 +769,7 @@ def test_a_command_starts_workers_and_the_sweep_follows_them(tmp_path):
     launch = f"{sys.executable} -m kerv_cli $(echo '{{command}}' | cut -d' ' -f2-) 2>{tmp_path}/said &"
     with pretending(brisk):
         store, outcome = swept(tmp_path, STUDY, brisk, runtime=RuntimeSettings(launch=launch))
-    assert (len(outcome.done), store.counts()) == (16, (16, 16)), (tmp_path / "said").read_text()
+    assert (len(outcome.done), counts_of(store)) == (16, (16, 16)), (tmp_path / "said").read_text()
 
 
 def test_a_sweep_without_workers_says_how_to_start_some(tmp_path):
@@ -781,4 +782,4 @@ def test_a_sweep_without_workers_says_how_to_start_some(tmp_path):
             assert queued(store.database) == 16
             raise KeyboardInterrupt
     assert said == [f"start workers, as many as you like: kerv work study=threshold results={tmp_path}"]
-    assert (queued(store.database), store.counts()) == (0, (0, 16))
+    assert (queued(store.database), counts_of(store)) == (0, (0, 16))

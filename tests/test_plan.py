@@ -15,7 +15,8 @@ from kerv_cli.episodes import identity
 from kerv_cli.episodes.identity import ENGINE, Setting, hash_of, without
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.plan import Block, all_episodes, blocks_of
-from kerv_cli.lab.store import Study
+from kerv_cli.lab.read import counts_of, frame_of, is_stored, loaded
+from kerv_cli.lab.store import Study, remove_study
 from kerv_cli.lab.study import plan_study
 from kerv_cli.report.summary import not_in_turn
 from kerv_cli.report.tables import load_study
@@ -60,7 +61,7 @@ def table_of(store: Study) -> pd.DataFrame:
 
 
 def same_wanted(store: Study, study: Study) -> bool:
-    return {(one.setting.label, one.key) for one in store.load().episodes} == {
+    return {(one.setting.label, one.key) for one in loaded(store).episodes} == {
         (one.setting.label, one.key) for one in study.episodes
     }
 
@@ -146,12 +147,12 @@ def test_sweeps_over_other_tasks_end_in_one_study(database):
     swept(database.results, threshold_study(["reach-v3"]))
     store, _ = swept(database.results, threshold_study(["push-v3"]))
     assert same_wanted(store, threshold_study(TASKS))
-    assert store.counts() == (32, 32)
+    assert counts_of(store) == (32, 32)
     store, _ = swept(database.results, threshold_study(["push-v3"], episodes=2))  # fewer seeds are fewer on all tasks
     assert same_wanted(store, threshold_study(TASKS, episodes=2))
     settings = {label: settings_of("ar", episodes=2) for label in ("ar", "other")}
     store, _ = swept(database.results, study_of(settings, ["push-v3"]))
-    assert {(one.setting.label, one.task) for one in store.load().episodes} == {
+    assert {(one.setting.label, one.task) for one in loaded(store).episodes} == {
         ("ar", "reach-v3"), ("ar", "push-v3"), ("other", "push-v3")
     }  # fmt: skip
 
@@ -163,9 +164,9 @@ def test_another_study_runs_only_what_it_does_not_share(database):
     assert to_run(planned(database, study)) == {("new", "reach-v3"): (list(range(100_000, 100_004)), "new setting")}
     other, outcome = swept(database.results, study)
     assert len(outcome.reused) == 8
-    store.remove()
-    assert not store.exists
-    assert other.counts() == (12, 12)
+    remove_study(store)
+    assert not is_stored(store)
+    assert counts_of(other) == (12, 12)
     assert len(table_of(other)) == 3
     assert len(to_run(planned(database, threshold_study(["reach-v3"])))) == 2  # only naive_sd and r=9 are gone
 
@@ -175,7 +176,7 @@ def test_two_labels_of_one_result_run_once(database):
     study = study_of({"ar": settings_of("ar"), "again": settings_of("ar")}, ["reach-v3"])
     store, outcome = swept(database.results, study)
     assert len(outcome.done) == 4
-    assert store.counts() == (8, 8)
+    assert counts_of(store) == (8, 8)
 
 
 @on_sqlite
@@ -192,12 +193,12 @@ def test_times_of_other_blocks_are_no_ratio_until_they_are_taken_in_turn(databas
 def test_a_rerun_keeps_the_older_measurement(database):
     study = threshold_study(["reach-v3"])
     store, _ = swept(database.results, study)
-    first = set(store.frame()["episode"])
+    first = set(frame_of(store)["episode"])
     assert why(planned(database, study, "all")) == {"rerun=all"}
     swept(database.results, study, rerun="all")
-    assert first.isdisjoint(store.frame()["episode"])
+    assert first.isdisjoint(frame_of(store)["episode"])
     newest = set(planned(database, study).existing.values())
-    assert newest == set(store.frame()["episode"])
+    assert newest == set(frame_of(store)["episode"])
 
 
 def test_an_interrupted_rerun_goes_on_without_rerun(database):
@@ -251,6 +252,6 @@ def test_what_depends_on_the_order_of_episodes_is_reused_whole(database):
     assert why(split) == {"new seeds", "order of episodes"}
     store, outcome = swept(database.results, study(4))
     assert len(outcome.done) == 6
-    ran = store.frame().query("label == 'heisd'")
+    ran = frame_of(store).query("label == 'heisd'")
     assert ran["block"].nunique() == 1
     assert ran.sort_values("order")["seed"].is_monotonic_increasing

@@ -14,6 +14,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.episodes.runner import Runner
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.presence import Presence, bury, living
+from kerv_cli.lab.read import frame_of
 from kerv_cli.lab.runs import Run
 from kerv_cli.lab.store import Study
 
@@ -46,9 +47,9 @@ def test_weights_that_are_replaced_while_a_sweep_runs_fail_the_setting(policies,
     assert "2 run, 0 reused, 1 failed" in said
     assert "the target of ar has changed from" in said
     assert str(target) in said
-    first = set(Study(opened(results), "tiny").frame()["episode"])
+    first = set(frame_of(Study(opened(results), "tiny"))["episode"])
     assert "3 run, 0 reused, 0 failed" in told(*words)
-    assert first.isdisjoint(Study(opened(results), "tiny").frame()["episode"])
+    assert first.isdisjoint(frame_of(Study(opened(results), "tiny"))["episode"])
 
 
 MAKES = """

@@ -19,6 +19,7 @@ from studies_synthetic import swept, threshold_study
 
 from kerv_cli.catalogue.entries import find_runs
 from kerv_cli.lab.database import opened
+from kerv_cli.lab.read import frame_of
 from kerv_cli.lab.runs import Run
 from kerv_cli.lab.work import EpisodeRunner
 
@@ -270,6 +271,6 @@ def test_episodes_and_decodes_as_parquet(tmp_path):
     works("runs", "export", "threshold", "--to", "parquet", "--dir", f"{tmp_path}/out", f"results={tmp_path}")
     folder = tmp_path / "out/threshold"
     episodes, decodes = (pd.read_parquet(folder / f"{name}.parquet") for name in ("episodes", "decodes"))
-    assert len(episodes) == len(store.frame()) == 32
+    assert len(episodes) == len(frame_of(store)) == 32
     counted = decodes.groupby(["label", "task", "seed"]).size()
     assert counted.to_dict() == episodes.set_index(["label", "task", "seed"])["decodes"].to_dict()

@@ -17,6 +17,7 @@ from kerv_cli.base.config import compose
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import EPISODES, UNFINISHED, WANTED, opened
+from kerv_cli.lab.read import counts_of
 from kerv_cli.lab.store import Study
 from kerv_cli.lab.work import Counted
 
@@ -112,7 +113,7 @@ def test_a_study_survives_its_sweep_a_cancelled_worker_and_a_preempted_one(tmp_p
     """The array of conf/runtime/slurm.yaml runs on when its sweep is killed; the next one starts another."""
     store, struck = Study(opened(tmp_path), "threshold"), []
     with python(SWEEP, tmp_path) as process:
-        until(lambda: store.counts()[0] >= 2, 120)
+        until(lambda: counts_of(store)[0] >= 2, 120)
         process.kill()
 
     def strike(event: object) -> None:
@@ -122,7 +123,7 @@ def test_a_study_survives_its_sweep_a_cancelled_worker_and_a_preempted_one(tmp_p
             run("scontrol", "requeue", struck[1])
 
     _, outcome = swept(tmp_path, STUDY, unhurried, runtime=SETTINGS, on_event=strike)
-    assert (len(struck) >= 2, outcome.failed, store.counts()) == (True, [], (36, 36))
+    assert (len(struck) >= 2, outcome.failed, counts_of(store)) == (True, [], (36, 36))
     with store.database.reading() as connection:
         assert connection.scalar(sa.select(sa.func.count()).select_from(EPISODES)) == 36
         assert connection.scalar(sa.select(sa.func.count()).select_from(WANTED).where(UNFINISHED)) == 0

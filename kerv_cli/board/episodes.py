@@ -18,6 +18,7 @@ from kerv_cli.board import episode
 from kerv_cli.board.pages import database_of, render
 from kerv_cli.catalogue.episodes import outcomes
 from kerv_cli.episodes.identity import Setting, stress_of
+from kerv_cli.lab.read import loaded
 from kerv_cli.lab.store import Study
 from kerv_cli.report.measures import NEAR
 from kerv_cli.report.tables import references_of
@@ -157,7 +158,7 @@ def clusters_of(cells: Sequence[Cell]) -> list[tuple[list[Cell], int]]:
 def _asked(request: Request) -> tuple[list[Cell], dict[str, Any]]:
     """Return the study's episodes, of the setting and task that the address names, and values for the templates."""
     store = Study(database_of(request), request.path_params["name"])
-    study = store.load(episodes=False)
+    study = loaded(store, episodes=False)
     baseline, settings = study.baseline, {one.label: one for one in study.settings}
     cells = cells_of(outcomes(store), baseline, settings)
     known = {"setting": list(settings), "task": sorted(set(map(attrgetter("task"), cells)))}

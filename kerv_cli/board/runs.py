@@ -19,6 +19,7 @@ from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.board.pages import database_of, refreshed, render
 from kerv_cli.catalogue.entries import RunEntry, children, description_of, disk_bytes, find_run, find_runs, parents
 from kerv_cli.lab.database import Database
+from kerv_cli.lab.read import counts_of, loaded, version_of
 from kerv_cli.lab.runs import RUNNING, run_rows
 from kerv_cli.lab.store import Study
 from kerv_cli.report.tables import flatten
@@ -123,12 +124,12 @@ def show_study(request: Request, version: str, is_live: bool) -> Response:
 
 def show_tables(request: Request) -> Response:
     database, name = database_of(request), request.path_params["name"]
-    store = Study(database, name).load(episodes=False)
+    store = loaded(Study(database, name), episodes=False)
     is_running = RUNNING in map(attrgetter("status"), run_rows(database, store.kind, name))
-    version = f"{store.version()}/{is_running}"
+    version = f"{version_of(store)}/{is_running}"
     if request.query_params.get("known") == version:
         return Response(status_code=204)
-    has_episodes = store.counts()[0] > 0
+    has_episodes = counts_of(store)[0] > 0
     parts, seconds = _parts(database, name, version, is_running) if has_episodes else ({}, _SECONDS)
     hidden: dict[str, Any] = {"recordings": [], "files": []} | ({"missing": 0} if is_running else {})
     if len(parts.get("settings", ())) == 1:

@@ -25,7 +25,7 @@ from kerv_cli.base.registry import ArtifactPart
 from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.lab.database import EPISODES, SETTINGS, STUDIES, WANTED, Database
 from kerv_cli.lab.runs import COMPLETE, RUNNING, RunRow, forget, run_rows, time_left
-from kerv_cli.lab.store import ROLLOUT, SWEEP, Study
+from kerv_cli.lab.store import ROLLOUT, SWEEP, Study, remove_study
 
 LOG, WEIGHTS = "log.csv", "model.safetensors"  # files of a training
 # Argument of commands that stands for the newest entry
@@ -336,7 +336,7 @@ def remove(run: RunEntry, database: Database) -> None:
     """
     gone = set_aside(run.folder)
     if run.has_episodes:
-        store_of(run, database).remove()
+        remove_study(store_of(run, database))
     forget(database, run.kind, run.id if run.has_episodes else run.id.removeprefix(f"{run.kind}/"))
     for folder in (gone, unfinished(run.folder)):
         shutil.rmtree(folder, ignore_errors=True)

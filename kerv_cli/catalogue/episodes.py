@@ -13,7 +13,8 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.lab.database import BLOCKS, EPISODES, MEASURES, SETTINGS, STUDIES, WANTED, Database
 from kerv_cli.lab.plan import Episode
-from kerv_cli.lab.store import Study, setting_of
+from kerv_cli.lab.read import decodes_of, setting_of
+from kerv_cli.lab.store import Study
 
 LARGEST_ID = 2**31 - 1
 
@@ -85,7 +86,7 @@ class FoundEpisode:
         """Read the episode's decodes, and the control step at which each executes its first action."""
         from kerv_cli.episodes.rows import decode_records
 
-        table = self.store.decodes([self.id])
+        table = decodes_of(self.store, [self.id])
         return decode_records(table), table["step"].to_pylist()
 
 

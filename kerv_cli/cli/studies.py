@@ -165,6 +165,7 @@ def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None =
 
 def print_study(data: StudyData, all_columns: bool = False, how: str = "") -> None:
     """Print the table of a study and its note. `how` is what to type to see all columns."""
+    from kerv_cli.lab.read import sweep_command
     from kerv_cli.report.summary import SummaryTable, not_in_turn
     from kerv_cli.report.tables import split_values
 
@@ -176,7 +177,7 @@ def print_study(data: StudyData, all_columns: bool = False, how: str = "") -> No
         typer.echo(f"its episodes are of {len(commits)} commits: {', '.join(sorted(one[:12] for one in commits))}")
     apart = not_in_turn(data.results)
     if apart:
-        mend = study.sweep_command("rerun=all")
+        mend = sweep_command(study, "rerun=all")
         typer.echo(f"no speedup of {', '.join(apart)}: not measured in turn with the baseline; '{mend}' does that")
     if data.study.note:
         typer.echo(f"\n{data.study.note}\n")

@@ -147,13 +147,14 @@ def print_outcome(study: Study, outcome: Outcome, data: StudyData | None, as_jso
 
 def write(study: Study, outcome: Outcome, data: StudyData | None, loss: float) -> None:
     """Write the report of a complete study, and print its verdict."""
+    from kerv_cli.lab.read import counts_of
     from kerv_cli.report.report import write_study
     from kerv_cli.report.tables import load_study
 
     if data is None or outcome.failed:
         return
     # the study in the database may have more tasks, from earlier sweeps
-    is_whole = study.counts()[1] == len(data.study.episodes)
+    is_whole = counts_of(study)[1] == len(data.study.episodes)
     report = write_study(data if is_whole else load_study(study), loss)
     print_prices(report.priced)
     print_verdict(report)

@@ -160,7 +160,6 @@ PLANNED = WANTED.join(SETTINGS).join(STUDIES)
 
 
 def now() -> str:
-    """Return the current time in UTC, ISO 8601 with milliseconds."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
@@ -174,9 +173,6 @@ class Database:
     Args:
         results: The results folder.
         url: URL of the database. If empty, the SQLite file in the results folder is used.
-
-    Raises:
-        UsageError: The URL or the results folder cannot be used.
     """
 
     def __init__(self, results: str | Path, url: str | sa.URL = "") -> None:
@@ -217,11 +213,9 @@ class Database:
 
     @property
     def exists(self) -> bool:
-        """Whether the SQLite file exists. Always True for a server."""
         return self.file is None or self.file.exists()
 
     def close(self) -> None:
-        """Close all connections."""
         if self._engine is not None:
             self._engine.dispose()
             self._engine = None
@@ -289,9 +283,6 @@ class Database:
 
         Args:
             what: What is converted, for the message.
-
-        Raises:
-            CheckpointError: A value is not what kerv stores.
         """
         try:
             yield
@@ -336,7 +327,6 @@ def clock(connection: sa.Connection) -> sa.ColumnElement[float]:
 
 
 def file_url(results: Path) -> sa.URL:
-    """Return the URL of the SQLite file in a results folder."""
     return sa.URL.create("sqlite", database=str(results.absolute() / FILE))
 
 

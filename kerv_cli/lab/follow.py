@@ -16,8 +16,9 @@ from kerv_cli.lab.database import EPISODES, SETTINGS, STUDIES, UNFINISHED, WANTE
 from kerv_cli.lab.plan import Episode
 from kerv_cli.lab.presence import beats
 from kerv_cli.lab.queue import Queue, patiently
+from kerv_cli.lab.read import counts_of, rows_of
 from kerv_cli.lab.runs import Run
-from kerv_cli.lab.store import ROLLOUT, rows_of
+from kerv_cli.lab.store import ROLLOUT
 from kerv_cli.lab.study import Plan, save, withdraw
 from kerv_cli.lab.work import (
     WAITING_SECONDS,
@@ -62,9 +63,6 @@ def begun(plan: Plan) -> Iterator[Run]:
     """Write the row of a command that runs a plan, for a `with` block.
 
     If the block raises an exception, what nobody runs is not asked for any more.
-
-    Raises:
-        Interrupted: Ctrl-C was pressed.
     """
     study = plan.study
     with Run(study.database, study.kind, study.name, plan.command, len(plan.to_run), study.kind == ROLLOUT) as run:
@@ -93,11 +91,6 @@ def run(plan: Plan, on_event: OnEvent = lambda event: None, *, write: Save = lam
         plan: The plan.
         on_event: Called with each event, to show progress.
         write: Writes the recording (.rrd file) of an episode. The default writes nothing.
-
-    Raises:
-        Interrupted: Ctrl-C was pressed.
-        KervError: An episode of a rollout failed.
-        StorageError: The disk is full or not writable.
     """
 
     def forward(event: Event) -> None:
@@ -112,9 +105,8 @@ def run(plan: Plan, on_event: OnEvent = lambda event: None, *, write: Save = lam
 
 
 def _kept(plan: Plan) -> str:
-    """Return how many episodes of a study are stored, as text. The text has no numbers if the database fails."""
     try:
-        done, total = plan.study.counts()
+        done, total = counts_of(plan.study)
         return f"{done} of {count(total or len(plan.study.episodes), 'episode')}"  # its plan may not be written yet
     except StorageError:
         return "all complete episodes"
@@ -172,7 +164,6 @@ def _left(plan: Plan, number: int) -> int:
 
 
 def _alive(plan: Plan, number: int) -> bool:
-    """Return whether a living worker runs an episode of the study."""
     with plan.study.database.reading() as connection:
         alive = sa.select(WORKERS.c.name).where(beats(connection))
         query = sa.select(sa.func.count()).where(WANTED.c.study_id == number, UNFINISHED)
@@ -180,11 +171,6 @@ def _alive(plan: Plan, number: int) -> bool:
 
 
 def _outcome(plan: Plan, number: int, seconds: float) -> Outcome:
-    """Read what has become of a plan's episodes.
-
-    Raises:
-        KervError: The study was deleted.
-    """
     study, outcome = plan.study, Outcome(seconds=seconds)
     with study.database.reading() as connection:
         rows = {(row.label, row.task, row.seed): row for row in rows_of(connection, study.name)}

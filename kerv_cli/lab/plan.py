@@ -42,12 +42,10 @@ class Episode:
 
     @property
     def key(self) -> Key:
-        """The setting's hash `work`, the task and the seed. Equal keys mean the same episode."""
         return self.setting.work, self.task, self.seed
 
     @property
     def recording(self) -> str:
-        """File name of the episode's recording."""
         name = f"{self.setting.label.replace('=', '')}-{self.task}-{self.seed}-{self.setting.work[:6]}.rrd"
         return re.sub(r"[^\w.+-]", "_", name)[-200:]
 
@@ -59,9 +57,6 @@ def all_episodes(settings: Sequence[Setting], tasks: Iterable[str], block: int =
         settings: The settings to compare.
         tasks: Names of the tasks.
         block: Number of seeds in a block. All settings run these seeds before the next block begins.
-
-    Raises:
-        UsageError: There are more than MOST_EPISODES.
     """
     tasks = list(dict.fromkeys(tasks))
     numbers = [setting.settings["episodes"] for setting in settings]
@@ -105,37 +100,30 @@ class Block:
 
     @property
     def task(self) -> str:
-        """Task of the block's first episode."""
         return self.episodes[0].task
 
     @functools.cached_property
     def settings(self) -> tuple[Setting, ...]:
-        """The block's settings, each once."""
         return tuple({one.setting.work: one.setting for one in self.episodes}.values())
 
     @property
     def keys(self) -> list[Key]:
-        """Key of each episode."""
         return list(map(attrgetter("key"), self.episodes))
 
     @property
     def seeds(self) -> list[int]:
-        """The block's seeds, each once, ascending."""
         return sorted(set(map(attrgetter("seed"), self.episodes)))
 
     @property
     def batch(self) -> int:
-        """Number of episodes that run at the same time."""
         return self.episodes[0].setting.batch
 
     @property
     def name(self) -> str:
-        """Task and seeds, e.g. `reach-v3 100000-100004`."""
         return f"{self.task} {seeds_text(self.seeds)}"
 
     @property
     def title(self) -> str:
-        """Name and size of the block, for a progress display."""
         if self.batch == 1:
             return f"{self.name}: {count(len(self.settings), 'setting')} in turn"
         label = self.episodes[0].setting.label
@@ -203,7 +191,6 @@ def _reasons(
     rerun: str,
     earlier: Mapping[str, Setting],
 ) -> dict[Episode, str]:
-    """Return the missing episodes, each with the reason for running it. `split` explains the arguments."""
     works, tasks = set(), set()
     for work, task, *_ in stored:
         works.add(work)

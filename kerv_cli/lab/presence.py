@@ -43,7 +43,6 @@ def _lock_of(database: Database, name: str) -> Path:
 
 
 def _lock(path: Path) -> int:
-    """Lock a new file until this process ends, or until the returned descriptor is closed."""
     with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
@@ -54,7 +53,6 @@ def _lock(path: Path) -> int:
 
 
 def _was_killed(path: Path) -> bool:
-    """Return whether a process of this machine has held a lock, and holds it no longer."""
     try:
         descriptor = os.open(path, os.O_RDONLY)
     except OSError:  # it is a process of another machine

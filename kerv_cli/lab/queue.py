@@ -18,7 +18,8 @@ from kerv_cli.episodes.identity import Setting
 from kerv_cli.lab.database import PLANNED, RUNS, SETTINGS, STUDIES, UNFINISHED, WANTED, WORKERS, Unanswered
 from kerv_cli.lab.plan import Block, Episode
 from kerv_cli.lab.presence import beats
-from kerv_cli.lab.store import ROLLOUT, Study, setting_of, stored_episodes, write_episode
+from kerv_cli.lab.read import setting_of, stored_episodes
+from kerv_cli.lab.store import ROLLOUT, Study, write_episode
 
 T = TypeVar("T")
 
@@ -91,7 +92,6 @@ class Queue:
         return Claim(run, Block(tuple(episodes.values())), deadly)
 
     def _others(self, connection: sa.Connection) -> Sequence[str]:
-        """Return the names of the other workers that live."""
         return connection.scalars(
             sa.select(WORKERS.c.name).where(beats(connection), WORKERS.c.name != self.worker)
         ).all()
@@ -119,11 +119,6 @@ class Queue:
         return sa.select(RUNS.c.id).where(*same).order_by(RUNS.c.started.desc(), RUNS.c.id.desc()).limit(1)
 
     def _settings_of(self, connection: sa.Connection, rows: Sequence[Any]) -> Mapping[int, Setting]:
-        """Return the study's settings by id. Their `results` is this process's results folder.
-
-        Raises:
-            KervError: This version of kerv computes other results than the version that planned the block.
-        """
         if not self._settings.keys() >= {row.setting_id for row in rows}:
             for one in connection.execute(sa.select(SETTINGS).where(SETTINGS.c.study_id == self.number)):
                 setting = setting_of(one)
@@ -162,7 +157,6 @@ class Queue:
         return linked
 
     def _rows(self, one: Episode) -> sa.ColumnElement[bool]:
-        """Return the condition of the rows of an episode: several, if settings with other labels share it."""
         ids = [number for number, setting in self._settings.items() if setting.work == one.setting.work]
         of_study = WANTED.c.study_id == self.number
         return sa.and_(of_study, WANTED.c.setting_id.in_(ids), WANTED.c.task == one.task, WANTED.c.seed == one.seed)
@@ -196,9 +190,6 @@ class Queue:
             row: Columns of the table `episodes`.
             decodes: The episode's decodes, as the bytes of a Parquet file.
             then: The episode that begins now. None if there is none.
-
-        Raises:
-            ClaimLost: The episode does not belong to this worker any more. Nothing is written.
         """
         with self.database.writing() as connection:
             # it is there already if it was committed, but the answer was lost
@@ -224,12 +215,7 @@ class Queue:
 
 
 def patiently(action: Callable[..., T], *arguments: Any) -> T:
-    """Call a function that uses the database. While the database does not answer, call it again.
-
-    Raises:
-        StorageError: The database did not answer for PATIENCE_SECONDS. Or calling again would not help, for example
-            because the disk is full.
-    """
+    """Call a function that uses the database. While the database does not answer, call it again."""
     deadline = time.monotonic() + PATIENCE_SECONDS
     while True:
         try:

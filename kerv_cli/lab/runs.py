@@ -196,7 +196,6 @@ class Run(Presence):
             super().__exit__(*error)
 
     def _was_refused(self, error: object) -> bool:
-        """Return whether the command was refused: by a UsageError, or by a CheckpointError before it made anything."""
         if not isinstance(error, CheckpointError):
             return isinstance(error, UsageError)
         with self.database.reading() as connection:

@@ -9,10 +9,12 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
 
+from kerv_cli.base.config import groups
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.paths import check_writable
 from kerv_cli.base.runtime import set_up
@@ -23,17 +25,9 @@ from kerv_cli.episodes.resolve import ResolvedStudy, located
 from kerv_cli.lab.database import EPISODES, SETTINGS, STUDIES, UNFINISHED, WANTED, Database
 from kerv_cli.lab.plan import ALL, NEVER, Block, Episode, all_episodes, blocks_of, ordered_parts, split
 from kerv_cli.lab.presence import living
+from kerv_cli.lab.read import counts_of, is_stored, rows_of, setting_of, stored_episodes, swept_by
 from kerv_cli.lab.runs import interrupted, running
-from kerv_cli.lab.store import (
-    ABOUT,
-    SWEEP,
-    Study,
-    rows_of,
-    save_settings,
-    setting_of,
-    stored_episodes,
-    study_row,
-)
+from kerv_cli.lab.store import ABOUT, SWEEP, Study, save_settings, study_row
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,13 +64,11 @@ class Plan:
 
     @property
     def device(self) -> str:
-        """Device of the episodes to run. Empty if they need different devices."""
         devices = {str(one.setting.settings["runtime"]["device"]) for one in self.to_run}
         return devices.pop() if len(devices) == 1 else ""
 
     @property
     def is_elsewhere(self) -> bool:
-        """Whether this command starts no worker of its own."""
         return _is_elsewhere(self.runtime)
 
 
@@ -85,13 +77,7 @@ def _is_elsewhere(runtime: RuntimeSettings) -> bool:
 
 
 def check(resolved: ResolvedStudy) -> tuple[Setting, ...]:
-    """Check the settings of a sweep or a rollout. Return them with the hashes of their weights, the baseline first.
-
-    Raises:
-        UsageError: A setting cannot run.
-        CheckpointError: A setting's weights or data cannot be read.
-        StorageError: The results folder is not writable.
-    """
+    """Check the settings of a sweep or a rollout. Return them with the hashes of their weights, the baseline first."""
     check_writable(str(resolved.first.results))
     settings = []
     for label, one in resolved.settings.items():
@@ -128,21 +114,35 @@ def plan(
     own = {name: getattr(about, name) for name in ABOUT}
     study = Study(database, about.name, kind, tuple(settings), episodes, **own)
     if kind == SWEEP:
-        study.check_source(command)
+        _check_source(study, command)
     else:
         begun = interrupted(database, kind, command)
-        done, total = replace(study, name=begun.name).counts() if begun else (0, 0)
+        done, total = counts_of(replace(study, name=begun.name)) if begun else (0, 0)
         begun = begun if 0 < done < total else None
         study = replace(study, name=begun.name if begun else new_name(study))
         rerun, runtime = NEVER if begun else ALL, replace(runtime, workers=1, launch="")
     return plan_study(study, rerun, runtime, command)
 
 
+def _check_source(study: Study, command: Sequence[str]) -> None:
+    """Refuse a sweep whose file has the name of a study that another file describes. A file may have moved."""
+    ours, theirs = (
+        next((word.partition("=")[2] for word in words if word.startswith("study=")), "")
+        for words in (command, swept_by(study))
+    )
+    is_there = Path(theirs).is_file() if "/" in theirs else theirs in groups()["study"]
+    if is_there and theirs != ours:
+        raise UsageError(
+            f"study={ours} would replace study '{study.name}' of {theirs} in {study.database.shown}: "
+            "choose another study.name=NAME"
+        )
+
+
 def new_name(study: Study) -> str:
     """Return a name for a new rollout, with date, time and methods: `20260301-142530-ar-spec_vla`."""
     methods = "-".join(dict.fromkeys(str(setting.settings["method"]) for setting in study.settings))
     name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{re.sub(r'[^A-Za-z0-9_.-]', '_', methods)[:32]}"
-    return f"{name}-{secrets.token_hex(2)}" if replace(study, name=name).exists else name
+    return f"{name}-{secrets.token_hex(2)}" if is_stored(replace(study, name=name)) else name
 
 
 def plan_study(
@@ -171,7 +171,6 @@ def plan_study(
 
 
 def _earlier(connection: sa.Connection, labels: Sequence[str]) -> dict[str, Setting]:
-    """Return, for each label, the newest stored setting that has episodes."""
     ran = sa.select(WANTED.c.setting_id).where(WANTED.c.episode_id.is_not(None))
     query = sa.select(SETTINGS).where(SETTINGS.c.label.in_(labels), SETTINGS.c.id.in_(ran)).order_by(SETTINGS.c.id)
     return {row.label: setting_of(row) for row in connection.execute(query)}
@@ -188,9 +187,6 @@ def save(plan: Plan, run: str = "") -> None:
     Args:
         plan: The plan.
         run: Id of this command.
-
-    Raises:
-        UsageError: Somebody runs the study with other settings under one of the labels.
     """
     with plan.study.database.writing() as connection:
         save_in(connection, plan, run)
@@ -269,7 +265,6 @@ def _positions(wanted: Iterable[tuple[int, str, int]], before: Mapping[tuple[int
 
 
 def _somebody_runs(connection: sa.Connection, study: Study, run: str) -> bool:
-    """Return whether another command makes the study, or a worker runs one of its episodes."""
     if any(row.id != run for row in running(study.database, connection, study.kind, study.name)):
         return True
     mine = WANTED.join(STUDIES, WANTED.c.study_id == STUDIES.c.id)
@@ -278,7 +273,6 @@ def _somebody_runs(connection: sa.Connection, study: Study, run: str) -> bool:
 
 
 def _check_orders(study: Study, to_run: Mapping[Episode, object], is_shared: bool) -> None:
-    """Refuse to add episodes to a group that must run in order, while somebody runs the study."""
     for part in ordered_parts(study.episodes, study.block) if is_shared else ():
         if 0 < sum(one in to_run for one in part) < len(part):
             raise UsageError(

@@ -30,6 +30,7 @@ from kerv_cli.lab.database import now
 from kerv_cli.lab.plan import Block, Episode, seeds_text
 from kerv_cli.lab.presence import Presence, bury
 from kerv_cli.lab.queue import MOST_DEATHS, Claim, ClaimLost, Queue, patiently
+from kerv_cli.lab.read import loaded
 from kerv_cli.lab.store import Study
 from kerv_cli.targets.provenance import stamp
 
@@ -146,14 +147,9 @@ def work_on(study: Study, run: str, on_event: OnEvent, save: Save) -> None:
         run: Id of the command that has started this process. Empty if a user has.
         on_event: Called with each event, to show progress.
         save: Writes the recording (.rrd file) of an episode.
-
-    Raises:
-        UsageError: The study is not in the database, or its device is not on this machine.
-        CheckpointError: Weights or data in this results folder differ from those with which the study was planned.
-        StorageError: The disk is full or not writable, or the database does not answer.
     """
     if not run:  # a sweep of this machine has checked its settings
-        study = study.load()
+        study = loaded(study)
         for setting in study.settings:
             set_up(setting.on(study.tasks[0]).runtime)
             checked(setting, study.tasks, str(study.database.results))
@@ -201,10 +197,6 @@ def work(
         prepare: Builds a setting's decoder for a task.
         on_event: Called with each event, to show progress.
         is_done: Says whether to end before all blocks have ended.
-
-    Raises:
-        StorageError: The disk is full or not writable, or the database did not answer for two minutes.
-        KervError: The blocks were planned by another version of kerv.
     """
     load, told = load_per_core(), 0.0
     with queue.database.kept_open():
@@ -225,7 +217,6 @@ def work(
 
 
 def load_per_core() -> float:
-    """Return the load average of this machine per core."""
     return round(os.getloadavg()[0] / (os.cpu_count() or 1), 2)
 
 
@@ -293,7 +284,6 @@ class _Attempt:
                 patiently(self.queue.survive, self.running)
 
     def _begin(self, one: Episode) -> None:
-        """Note that an episode, or the preparation of its setting, begins, unless that is noted."""
         if one is not self.running:
             patiently(self.queue.begin, one, self.running)
             self.running = one
@@ -316,7 +306,6 @@ class _Attempt:
                 self._fail(self.left[0], failure_of(error))
 
     def _end(self, one: Episode, record: EpisodeRecord, order: int, started: datetime) -> None:
-        """Commit an episode that has ended. The same transaction notes which one begins."""
         row = episode_row(record) | {
             "order": order,
             "started": started.isoformat(timespec="milliseconds"),
@@ -331,19 +320,13 @@ class _Attempt:
         self.on_event(EpisodeEnd(one, bool(row["success"]), float(row["wall_seconds"])))
 
     def _row(self) -> dict[str, Any]:
-        """Return the block's row, which is written with the first episode."""
         runtime = self.claim.block.episodes[0].setting.settings["runtime"]
         about = stamp(str(runtime["device"])) | {"engine": ENGINE, "load": self.load, "workers": runtime["workers"]}
         return {"id": self.id, "run": self.claim.run, "seeds": seeds_text(self.claim.block.seeds),
                 "started": self.started, "about": about}  # fmt: skip
 
     def _fail(self, one: Episode, failure: SettingFailed) -> None:
-        """Report that a setting failed on a task. Its remaining episodes in the block will not run.
-
-        Raises:
-            StorageError: The setting failed with this error. No other setting could be stored either.
-            ClaimLost: The setting failed with this error: its episodes do not belong to this worker any more.
-        """
+        """Report that a setting failed on a task. Its remaining episodes in the block will not run."""
         if isinstance(failure.error, StorageError | ClaimLost):
             raise failure.error
         same = [other for other in self.left if (other.setting.work, other.task) == (one.setting.work, one.task)]
@@ -382,7 +365,6 @@ class EpisodeRunner:
     save: Save
 
     def __call__(self, setting: Setting, task: str) -> RunEpisode:
-        """Build the setting's decoder for a task. Return a function that runs the episode with a given seed."""
         runner = _loaded(setting, [task], lambda: Runner(setting.on(task), task))
 
         def run_episode(seed: int) -> EpisodeRecord:
@@ -407,11 +389,7 @@ class EpisodeRunner:
 
 
 def _loaded(setting: Setting, tasks: list[str], load: Callable[[], T]) -> T:
-    """Return what a function loads. The weights on the disk are those of the plan, before and after.
-
-    Raises:
-        CheckpointError: They have changed since the study was planned.
-    """
+    """Return what a function loads. The weights on the disk are those of the plan, before and after."""
     results = str(setting.settings["results"])
     checked(setting, tasks, results, is_awaited=True)
     loaded = load()

@@ -75,9 +75,6 @@ def workers(plan: Plan, run: str, say: Callable[[str], object] = lambda line: No
 
     Yields:
         A function to call again and again. It frees what killed workers had claimed, and replaces them.
-
-    Raises:
-        KervError: The command of `runtime.launch` fails.
     """
     runtime, study = plan.runtime, plan.study
     # a cluster's jobs find `kerv` where this process runs, also when its folder is not on the user's PATH
@@ -107,7 +104,6 @@ def _launch(line: str, environment: dict[str, str]) -> None:
 
 
 def last_line(text: str) -> str:
-    """Return the last line of `text` that is not blank. Empty if every line is blank."""
     return text.strip().rpartition("\n")[2].strip()
 
 
@@ -168,7 +164,6 @@ class LocalWorkers:
             bury(self.database)
 
     def _read_progress(self) -> tuple[int, int]:
-        """Return the number of unfinished episodes, and how often one was begun: a death in an episode changes it."""
         begun = sa.func.coalesce(sa.func.sum(WANTED.c.attempts), 0)
         query = sa.select(sa.func.count(), begun).select_from(PLANNED)
         with self.database.reading() as connection:
@@ -188,12 +183,7 @@ class LocalWorkers:
         worker.log.close()
 
     def tend(self) -> None:
-        """Free what killed workers had claimed, and replace them.
-
-        Raises:
-            KervError: A worker has ended with an error, or MOST_STILLBORN in a row were killed before they claimed a
-                block.
-        """
+        """Free what killed workers had claimed, and replace them."""
         patiently(bury, self.database)
         for at, worker in enumerate(self._workers):
             code = worker.process.poll()

@@ -13,6 +13,7 @@ from kerv_cli.catalogue.entries import RunEntry, description_of, find_run, store
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Setting, without
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.plan import seeds_text
+from kerv_cli.lab.read import decodes_of, frame_of, loaded
 from kerv_cli.report.measures import Row
 from kerv_cli.report.tables import StudyData, differences, flatten, load_study, split_values
 
@@ -53,7 +54,7 @@ def compared_runs(database: Database, name: str) -> list[ComparedRun]:
         if label:
             raise UsageError(f"{run.id} is a {run.kind}: it has no setting '{label}'")
         return [ComparedRun(run.id, run)]
-    labels = store_of(run, database).load().labels
+    labels = loaded(store_of(run, database)).labels
     if not labels:
         raise UsageError(f"study {run.id} has no setting: remove it with 'kerv runs rm {run.id}'")
     if label and label not in labels:
@@ -127,9 +128,9 @@ def _same_tokens(first: ComparedRun, second: ComparedRun) -> str:
 
 def _tokens(side: ComparedRun) -> pd.DataFrame:
     assert side.data is not None
-    frame = side.data.study.frame()
+    frame = frame_of(side.data.study)
     frame = frame[frame["label"] == side.label][["episode", "task", "seed"]].reset_index(drop=True)
     # `episode` of the decodes is a position in the list
-    decodes = side.data.study.decodes(frame["episode"].tolist(), ["tokens"]).to_pandas()
+    decodes = decodes_of(side.data.study, frame["episode"].tolist(), ["tokens"]).to_pandas()
     tokens = decodes.groupby("episode")["tokens"].agg(lambda rows: tuple(map(tuple, rows)))
     return frame.assign(tokens=tokens.reindex(range(len(frame))).to_list())

@@ -11,6 +11,7 @@ from kerv_cli.base.files import atomic_path, write_text
 from kerv_cli.catalogue.entries import RunEntry, store_of
 from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.lab.database import Database
+from kerv_cli.lab.read import decodes_of, frame_of, how_to_run
 from kerv_cli.lab.store import Study
 
 FORMATS = ("csv", "parquet")
@@ -21,9 +22,9 @@ def export(run: RunEntry, database: Database, to: str, folder: Path) -> list[Pat
     if to not in FORMATS:
         raise UnknownName("format", to, FORMATS)
     store = store_of(run, database)
-    episodes = store.frame()
+    episodes = frame_of(store)
     if episodes.empty:
-        raise UsageError(f"study '{store.name}' has no episode yet: {store.how_to_run()}")
+        raise UsageError(f"study '{store.name}' has no episode yet: {how_to_run(store)}")
     if to == "parquet":
         return _to_parquet(store, episodes, folder / run.id)
     path = folder / f"{run.id}.csv"
@@ -45,7 +46,7 @@ def _to_parquet(store: Study, frame: pd.DataFrame, folder: Path) -> list[Path]:
     with atomic_path(decodes) as path, pq.ParquetWriter(path, schema, compression="zstd") as writer:
         for start in range(0, len(frame), _AT_ONCE):
             part = frame.iloc[start : start + _AT_ONCE]
-            rows = store.decodes(list(part["episode"]))
+            rows = decodes_of(store, list(part["episode"]))
             episode_keys = pa.Table.from_pandas(part[keys], preserve_index=False).take(rows["episode"])
             columns = [*episode_keys.columns, *rows.select(DECODE_SCHEMA.names).columns]
             writer.write_table(pa.table(columns, names=schema.names).cast(schema))

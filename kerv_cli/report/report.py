@@ -23,7 +23,8 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_json, write_text
 from kerv_cli.episodes.identity import NOT_DETERMINING, without
 from kerv_cli.lab.database import Database
-from kerv_cli.lab.store import ROLLOUT, SWEEP, Study, studies
+from kerv_cli.lab.read import counts_of, studies, sweep_command
+from kerv_cli.lab.store import ROLLOUT, SWEEP, Study
 from kerv_cli.report.measures import MACRO, MICRO, Measures, Result, Row, columns_of, csv_text
 from kerv_cli.report.plots import about, acceptance_figure, library, study_figures
 from kerv_cli.report.profiles import NamedProfile, open_profiles
@@ -62,7 +63,7 @@ _FRAMES = 240
 def to_report(database: Database, study: str | None) -> list[Study]:
     if study:
         return [Study(database, study)]
-    stores = [one for one in studies(database) if one.kind != ROLLOUT and one.counts()[0]]
+    stores = [one for one in studies(database) if one.kind != ROLLOUT and counts_of(one)[0]]
     if not stores:
         raise UsageError(f"no study in {database.results} has an episode: run `kerv sweep study=demo`")
     return sorted(stores, key=lambda one: one.name)
@@ -85,7 +86,7 @@ class Report:
     def command_to_settle(self) -> str:
         """The command that runs enough episodes for the verdict to name a setting. Empty if `Verdict.episodes` is 0."""
         study, episodes = self.data.study, self.verdict.episodes
-        return study.sweep_command(f"episodes={episodes}") if study.kind == SWEEP and episodes else ""
+        return sweep_command(study, f"episodes={episodes}") if study.kind == SWEEP and episodes else ""
 
     @functools.cached_property
     def figures(self) -> dict[str, alt.ConcatChart]:
@@ -120,7 +121,7 @@ def report(
         raise UsageError(f"{given}: name the study with study=NAME")
     profiles, reports = open_profiles(database.results, on), []
     for store in to_report(database, study):
-        say(f"{store.name}: reading {count(store.counts()[0], 'episode')}")
+        say(f"{store.name}: reading {count(counts_of(store)[0], 'episode')}")
         data = load_study(store)
         if baseline:
             data = data.compared_with(baseline)
@@ -225,7 +226,7 @@ def study_parts(report: Report) -> dict[str, Any]:
         "caution": caution(rows),
         "missing": len(data.absent),
         "absent": list(dict.fromkeys(f"{one.setting.label} on {one.task}" for one in data.absent)),
-        "again": study.sweep_command(),
+        "again": sweep_command(study),
         "main": MAIN,
         "columns": note_of(rows, list(suite[0])[:MAIN]),
         "meanings": {name: text.format(study.baseline) for name, text in MEANINGS.items()},

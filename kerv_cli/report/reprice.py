@@ -19,6 +19,7 @@ import pyarrow.compute as pc
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.episodes.cost import COUNTED, READ_PHASES, Profile, Work, prices, read_profile, work_of
+from kerv_cli.lab.read import decodes_of
 from kerv_cli.report.measures import MICRO, Measures, Result, Row, columns_of, measure, paired, speedups
 from kerv_cli.report.profiles import NamedProfile, open_profiles
 from kerv_cli.report.tables import StudyData
@@ -133,7 +134,7 @@ def _work_of_label(data: StudyData, label: str) -> _LabelWork:
             f"setting '{label}' ran {batch} episodes at a time, without times: run it with rollout.batch=1"
         )
     episodes = data.episodes.loc[data.episodes["label"] == label, "episode"]
-    table = data.study.decodes(episodes.tolist(), READ).combine_chunks()
+    table = decodes_of(data.study, episodes.tolist(), READ).combine_chunks()
     rounds = table["rounds"].combine_chunks()
     counts = pc.list_value_length(rounds).to_numpy(zero_copy_only=False).astype(np.int64)
     every = rounds.flatten()

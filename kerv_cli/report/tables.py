@@ -18,6 +18,7 @@ import pandas as pd
 from kerv_cli.base.errors import UsageError
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, Setting, flat, stress_of, without
 from kerv_cli.lab.plan import Episode, seeds_text
+from kerv_cli.lab.read import decodes_of, frame_of, how_to_run, loaded, whole_runs
 from kerv_cli.lab.store import Study
 from kerv_cli.report.measures import (
     MACRO,
@@ -145,7 +146,7 @@ class StudyData:
                 continue
             numbers, tally = own.sort_values("seed", kind="stable")["episode"].tolist()[:MOST_TALLIED], NO_TALLY
             for first in range(0, len(numbers), _AT_ONCE):
-                decodes = self.study.decodes(numbers[first : first + _AT_ONCE], ("rounds",))
+                decodes = decodes_of(self.study, numbers[first : first + _AT_ONCE], ("rounds",))
                 tally += Tally.of_rounds(decodes["rounds"].combine_chunks().flatten())
             tallies[label] = tally
         return tallies
@@ -200,17 +201,17 @@ def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyDa
         wanted: Episodes to read. Settings without any of them are left out.
     """
     if wanted is None:
-        study = study.load()
+        study = loaded(study)
     else:
         labels = set(map(attrgetter("setting.label"), wanted))
         settings = tuple(setting for setting in study.settings if setting.label in labels)
         study = replace(study, settings=settings, episodes=tuple(wanted))
-    frame = study.frame(wanted)
+    frame = frame_of(study, wanted)
     if frame.empty:
-        raise UsageError(f"study '{study.name}' has no episode yet: {study.how_to_run()}")
-    whole = study.whole_runs() if wanted is None else []
+        raise UsageError(f"study '{study.name}' has no episode yet: {how_to_run(study)}")
+    whole = whole_runs(study) if wanted is None else []
     same_pairs = len(whole) > 2
-    frames = [study.frame(run=run) for run in whole] if same_pairs else _with_new_seeds(frame)
+    frames = [frame_of(study, run=run) for run in whole] if same_pairs else _with_new_seeds(frame)
     # imported episodes may lack some columns
     states = {name: set(frame[name].unique()) for name in frame.columns.intersection(list(_ONE_STATE))}
     runs = [_labelled(study, run) for run in frames if all(set(run[name].unique()) == states[name] for name in states)]

@@ -34,7 +34,7 @@ from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.lab import database as tables
 from kerv_cli.lab import follow, presence, queue, work
 from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, SETTINGS, STUDIES, UNFINISHED, WANTED, WORKERS, Database
-from kerv_cli.lab.store import Study
+from kerv_cli.lab.store import Study, remove_study
 
 SECONDS = 1.5
 """Time in which things happen. Then everybody is left in peace."""
@@ -181,7 +181,7 @@ class Trial:
         def job(trial: Trial) -> None:
             for _ in range(4):
                 time.sleep(0.15)
-                Study(trial.database(), study.name).remove()
+                remove_study(Study(trial.database(), study.name))
                 follow.save(synthetic.planned(trial.database(), study))
 
         return job
