@@ -79,7 +79,7 @@ def _to(name: str, column: str, **options: Any) -> sa.Column[Any]:
 ABOUT = _table("kerv", sa.Column("key", _Text, primary_key=True), sa.Column("value", _Text, nullable=False))
 RUNS = _table(
     "runs",  # one row per command that was started
-    # kind: sweep, rollout, import, or a kind of artifact; name: of the study or the artifact; started: ISO 8601, UTC;
+    # kind: sweep, rollout, or a kind of artifact; name: of the study or the artifact; started: ISO 8601, UTC;
     # command: command-line arguments without `kerv`
     sa.Column("id", _Text, primary_key=True),
     *_required(_Text, "kind", "name", "status", "host", "git_commit", "message", "started"),
@@ -98,7 +98,7 @@ STUDIES = _table(
     "studies",
     sa.Column("id", sa.Integer, primary_key=True),
     sa.Column("name", _Text, nullable=False, unique=True),
-    *_required(_Text, "kind", "created"),  # kind: sweep, rollout or import
+    *_required(_Text, "kind", "created"),  # kind: sweep or rollout
     *_required(_JSON, "about"),  # title, baseline, axis, note, block, machines
 )
 SETTINGS = _table(

@@ -114,7 +114,7 @@ class Run(Presence):
 
     Args:
         database: Where the row is written.
-        kind: sweep, rollout, import, or the kind of artifact (weights or data) that the command makes.
+        kind: sweep, rollout, or the kind of artifact (weights or data) that the command makes.
         name: Name of the study or artifact.
         command: Command-line arguments (without `kerv`) that resume the command. If empty, `current_command()`.
         total: Number of steps or episodes.
@@ -231,26 +231,10 @@ def command_to_go_on(database: Database, kind: str, folder: Path) -> tuple[str, 
     return rows[0].command if rows and rows[0].status != COMPLETE else ()
 
 
-def interrupted(database: Database, kind: str, command: Sequence[str], name: str | None = None) -> RunRow | None:
-    """Return the row of a command that did not complete. If it was tried several times, return the first try's row.
-
-    Tries before the command was last complete do not count. None if the command has no row, or if its newest row is
-    complete. Also None if another command has made the same study or artifact since.
-
-    Args:
-        database: The database.
-        kind: Kind of the study or artifact.
-        command: Command-line arguments (without `kerv`).
-        name: Name of the study or artifact. If None, the name in the command's newest row.
-    """
-    first, rows = None, run_rows(database, kind, name)
-    name = next((row.name for row in rows if row.command == tuple(command)), None)
-    for row in rows:
-        if row.name == name:
-            if row.command != tuple(command) or row.status == COMPLETE:
-                break
-            first = row
-    return first
+def interrupted(database: Database, kind: str, command: Sequence[str]) -> RunRow | None:
+    """Return the newest row of a command (without `kerv`) if it did not complete."""
+    row = next((row for row in run_rows(database, kind) if row.command == tuple(command)), None)
+    return None if row is None or row.status == COMPLETE else row
 
 
 def forget(database: Database, kind: str, name: str) -> None:
