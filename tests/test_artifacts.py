@@ -38,7 +38,7 @@ STUDY = (
     "method=kerv threshold.k_s=0.3",
     "method=spec_vla proposer=retrieval acceptance=sequence",
     "method=heisd skip.s_min=0.9",
-    "method=heisd skip.s_min=0.8 boundary=random",
+    "method=heisd skip.s_min=0.8 boundary=always_retrieval",
     "method=spec_vla proposer=kalman",
 )
 FILES = {name: f"{name}.json" for name in ("drafter", "early", "calibration")} | {"datastore": "manifest.json"}

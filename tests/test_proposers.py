@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from loaded import datastore_of
 from test_decoding_lossless import assert_adds_up, plain_greedy, random_prompt, random_target
 
+from kerv_cli.base.registry import NoSettings
 from kerv_cli.engine.chunk import Chunk, Follower
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
@@ -21,9 +22,8 @@ from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early.drafter import EarlyProposer
 from kerv_cli.methods.heisd import (
+    Always,
     HybridProposer,
-    Random,
-    RandomBoundarySettings,
     RetrievalProposer,
     RetrievalProposerSettings,
     SimilaritySkipSettings,
@@ -38,6 +38,7 @@ from kerv_cli.worlds.metaworld.spec import SPEC
 
 SPACE = SPEC.actions
 D = SPACE.dofs
+SIDES = "always_drafter", "always_retrieval"
 HELD = SPACE.is_strict
 
 
@@ -114,7 +115,7 @@ def test_every_proposer_is_lossless(name, seed, chunk, data):
     where = "after" if name == "hybrid" else data.draw(st.sampled_from(["after", "inside", "both"]), "where")
     before = None if where == "after" else known[name]
     after = {"after": known[name], "inside": None, "both": known["hybrid"]}[where]
-    boundary = Random(RandomBoundarySettings()) if after is known["hybrid"] else None
+    boundary = Always(NoSettings(data.draw(st.sampled_from(SIDES)))) if after is known["hybrid"] else None
     steps = data.draw(st.integers(0, chunk), "steps decoded, 0: all")
     decoder = Decoder(target, Parts(prefill_draft=before, proposer=after, boundary=boundary), chunk=steps)
     moved(decoder, np.random.default_rng(seed), data.draw(st.integers(0, 12), "executed"))
@@ -226,8 +227,8 @@ def test_nothing_is_skipped_on_the_drafters_side():
     retrieval = decoder.parts.proposer
     drafter = EagleDrafter().network(DrafterSettings(), decoder.target).eval().requires_grad_(False)
     drafting = DrafterProposer(drafter, decoder.target, depth=4, top_k=1, nodes=4)
-    for p, forwards in ((0.0, True), (1.0, False)):
-        boundary = Random(RandomBoundarySettings(p=p))
+    for side, forwards in zip(SIDES, (True, False), strict=True):
+        boundary = Always(NoSettings(side))
         parts = Parts(proposer=HybridProposer(drafting, retrieval), boundary=boundary, skip=decoder.parts.skip)  # type: ignore[arg-type]
         hybrid = Decoder(decoder.target, parts)
         moved(hybrid, np.random.default_rng(0), 3)

@@ -157,20 +157,6 @@ def test_a_fused_boundary_needs_three_positions_and_the_fixed_kinds_need_none(n)
         assert boundary_of(f"always_{mode}").choose(path).mode == mode
 
 
-def test_random_keeps_its_share_and_repeats_itself():
-    boundary, other = (boundary_of("random", p=0.3, seed=seed) for seed in (5, 6))
-
-    def modes(task, seed, boundary=boundary):
-        boundary.reset(task, seed)
-        return [boundary.choose(np.zeros((0, 3))).mode for _ in range(2000)]
-
-    assert modes("reach-v3", 100_000) == modes("reach-v3", 100_000)
-    assert modes("reach-v3", 100_000) != modes("reach-v3", 100_001)
-    assert modes("reach-v3", 100_000) != modes("push-v3", 100_000)
-    assert modes("reach-v3", 100_000) != modes("reach-v3", 100_000, other)
-    assert np.mean([m == "retrieval" for m in modes("reach-v3", 100_000)]) == pytest.approx(0.3, abs=0.05)
-
-
 # --- thresholds
 
 levels = st.floats(0, 50)

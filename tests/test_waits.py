@@ -13,13 +13,14 @@ from pretended_device import DEVICE, Device, move
 from test_decoding_lossless import random_prompt, random_target
 from test_proposers import HELD, D, moved, retrieval_of, stored
 
+from kerv_cli.base.registry import NoSettings
 from kerv_cli.engine.decoder import Decoder, Parts, Stopwatch
 from kerv_cli.engine.record import PHASES
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter, EagleNetwork
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
-from kerv_cli.methods.heisd import HybridProposer, Random, RandomBoundarySettings
+from kerv_cli.methods.heisd import Always, HybridProposer
 from kerv_cli.methods.kerv.prediction import Hold, Kalman, Noise, PredictionProposer
 from kerv_cli.methods.merged import MergedProposer
 from kerv_cli.methods.reuse import JacobiProposer, JacobiProposerSettings
@@ -50,8 +51,8 @@ def parts_of(family: str, target: Any, prompt: torch.Tensor, truth: list[int]) -
         "hold": Parts(proposer=hold),
         "kalman": Parts(proposer=kalman),
         "retrieval": Parts(proposer=retrieval),
-        "hybrid, drafter": Parts(proposer=both, boundary=Random(RandomBoundarySettings(p=0.0))),
-        "hybrid, retrieval": Parts(proposer=both, boundary=Random(RandomBoundarySettings(p=1.0))),
+        "hybrid, drafter": Parts(proposer=both, boundary=Always(NoSettings("always_drafter"))),
+        "hybrid, retrieval": Parts(proposer=both, boundary=Always(NoSettings("always_retrieval"))),
         "hold in the prefill": Parts(prefill_draft=hold),
         "early": Parts(prefill_draft=early),
         "merged": Parts(prefill_draft=merged),

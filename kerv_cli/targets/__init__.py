@@ -1,4 +1,4 @@
-"""Register kerv's own families of targets: compact, grown and OpenVLA. Each function imports its module when called."""
+"""Register kerv's own families of targets: compact, grown and OpenVLA. Their modules are imported when needed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from kerv_cli.base.registry import Part
+from kerv_cli.base.registry import Part, load
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,46 +27,15 @@ class TargetPart(Part):
     images_alone: bool = False
 
 
-@TargetPart("compact")
-def compact(*arguments: Any) -> Any:
-    from kerv_cli.targets.compact.target import build
-
-    return build(*arguments)
+def _at(name: str) -> Callable[..., Any]:
+    return lambda *arguments: load(f"kerv_cli.targets.{name}")(*arguments)
 
 
-def _grow(*arguments: Any) -> Any:
-    from kerv_cli.targets.grown import grow
-
-    return grow(*arguments)
-
-
-def _check_grown(*arguments: Any) -> None:
-    from kerv_cli.targets.grown import check_weights
-
-    check_weights(*arguments)
-
-
-@TargetPart("grown", importer=_grow, check_weights=_check_grown)
-def grown(*arguments: Any) -> Any:
-    from kerv_cli.targets.grown import build
-
-    return build(*arguments)
-
-
-def _import_openvla(*arguments: Any) -> Any:
-    from kerv_cli.targets.openvla.target import import_checkpoint
-
-    return import_checkpoint(*arguments)
-
-
-def _check_openvla(*arguments: Any) -> None:
-    from kerv_cli.targets.openvla.target import check_weights
-
-    check_weights(*arguments)
-
-
-@TargetPart("openvla", importer=_import_openvla, check_weights=_check_openvla, images_alone=True)  # reads no state
-def openvla(*arguments: Any) -> Any:
-    from kerv_cli.targets.openvla.target import build
-
-    return build(*arguments)
+TargetPart("compact")(_at("compact.target:build"))
+TargetPart("grown", importer=_at("grown:grow"), check_weights=_at("grown:check_weights"))(_at("grown:build"))
+TargetPart(
+    "openvla",
+    importer=_at("openvla.target:import_checkpoint"),
+    check_weights=_at("openvla.target:check_weights"),
+    images_alone=True,  # it reads no state
+)(_at("openvla.target:build"))

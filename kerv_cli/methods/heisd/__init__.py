@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from kerv_cli.base import registry
 from kerv_cli.base.limits import MOST_BINS, MOST_DECODES, MOST_TOKENS, number
@@ -207,36 +206,6 @@ class HybridRule(RelaxedRule):
 # A boundary looks at the hand's last measured positions: R is their radius of curvature, D the length of their path. A
 # straight, fast path (large R, large D) repeats demonstrated motion, so retrieval drafts. A curved or slow path is
 # precise work, for which the drafter is better.
-
-
-@dataclass
-class RandomBoundarySettings:
-    """Choose retrieval or the drafter at random: a baseline for boundary=fused."""
-
-    kind: str = "random"
-    p: float = number(0.5, 0, 1)  # probability of retrieval
-    seed: int = number(0, 0, 2**32 - 1)
-
-
-@registry.BoundaryPart("random", RandomBoundarySettings, chooses=True)
-class Random(Boundary):
-    """Chooses retrieval with probability p, else the drafter: a baseline that ignores the path of the hand.
-
-    With p = 1 retrieval drafts all chunks, with p = 0 the drafter drafts all. An episode's random numbers depend only
-    on the boundary's seed, the task's full name and the episode's seed.
-    """
-
-    def __init__(self, settings: RandomBoundarySettings, context: Any = None) -> None:
-        super().__init__(settings)
-        self.reset("", 0)
-
-    def reset(self, task: str, seed: int) -> None:
-        import numpy as np
-
-        self.random = np.random.default_rng([self.settings.seed, zlib.crc32(task.encode()), seed])
-
-    def choose(self, path: np.ndarray) -> Choice:
-        return Choice("retrieval" if self.random.random() < self.settings.p else "drafter")
 
 
 class Always(Boundary):
