@@ -55,9 +55,9 @@ class Reach(StepBenchmark):
 
     executed: ClassVar[dict[int, list[np.ndarray]]] = {}
 
-    def __init__(self, send_images: bool = True, **params: Any) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.send_images, self.spec = send_images, spec_of("reach-v3")
+        self.spec = spec_of("reach-v3")
         self.camera = self.spec.camera(CameraSettings("corner4"))
         self.world: Any = self.spec.open_world("reach-v3", self.camera, HORIZON)
 
@@ -74,7 +74,7 @@ class Reach(StepBenchmark):
         return StepResult(self.world.step(self.actions[-1]), float(self.world.success), self.world.done, {})
 
     def make_obs(self, raw_obs: Any, task: dict[str, Any]) -> dict[str, Any]:
-        images = self.world.observe([self.camera.name]).images if self.send_images else {}
+        images = self.world.observe([self.camera.name]).images
         return {"images": images, "task_description": self.world.instruction, "state": raw_obs.state}
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
@@ -165,7 +165,7 @@ def test_hello_says_what_the_policy_reads_and_sends(policy):
         kind, about = Client(port).ask("hello", {"protocol_version": 1, "harness_version": "0.8.0"})
     assert kind == "hello"
     assert (about["protocol_version"], about["model_server"]) == (1, "kerv")
-    assert about["observation_params"] == {"camera": "corner4", "image_size": 96}
+    assert "observation_params" not in about  # no benchmark of vla-eval takes kerv's cameras
     assert about["kerv"]["settings"]["method"] == "ar"
     own = {key: {name: DimSpec.from_dict(one) for name, one in about[key].items()} for key in about if "spec" in key}
     world = {"corner4": IMAGE_RGB, "language": LANGUAGE, "state": DimSpec("state", 4, "_".join(OBSERVED))}

@@ -54,18 +54,6 @@ def _gripper_format(interface: Interface) -> str:
     return {-1.0: "binary_close_negative", 1.0: "binary_close_positive"}.get(closes, "continuous_01")
 
 
-def observation_params(interface: Interface) -> dict[str, object]:
-    """Return the arguments that a benchmark should pass to the policy's own environment.
-
-    The benchmark's YAML file overrides these arguments. Empty if the environment is unknown or needs no arguments.
-    """
-    if not interface.grip or interface.images_alone:
-        return {}
-    if not interface.cameras:
-        return {"send_images": False, "privileged": interface.privileged}
-    return {"camera": interface.cameras[0], "image_size": interface.size}
-
-
 class _Episode:
     """An episode in progress. `payload` is the content of the message that starts the episode."""
 
@@ -116,8 +104,6 @@ class VlaEval(Conversation):
             )
         about: dict[str, object] = {"harness_version": f"kerv {version('kerv')}", "protocol_version": PROTOCOL_VERSION}
         about |= {"model_server": "kerv", "capabilities": {}, "kerv": self.policy.facts(), **dim_specs(self.interface)}
-        if params := observation_params(self.interface):
-            about["observation_params"] = params
         return self._message("hello", about)
 
     def _start(self, payload: Message) -> None:
