@@ -93,7 +93,7 @@ class DistanceRule(Buildable):
 
     def same_limits(self, r: int, strict: bool = True) -> tuple[int, ...]:
         """Return the limit r for each of the D DoFs, in bins. With `strict`, strict DoFs (such as a gripper) get 0."""
-        return tuple([0 if one else r for one in self._strict]) if strict else (r,) * self.space.kinds
+        return tuple([0 if strict and one else r for one in self._strict])
 
     @functools.cached_property
     def _strict(self) -> list[bool]:

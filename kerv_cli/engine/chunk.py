@@ -16,7 +16,7 @@ import numpy as np
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.decisions import ROOT, Choice, Judged, Rectified, SkipDecision
-from kerv_cli.engine.record import PARALLEL, DecodeRecord, Round
+from kerv_cli.engine.record import PARALLEL, DecodeRecord, Round, variability
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -197,6 +197,10 @@ class Chunk:
             node = nodes[node, token]
         return targets if len(targets) >= self.size - 1 else None
 
+    @cached_property
+    def variability(self) -> float | None:
+        return variability(self.rounds, self.space)  # of the finished chunk
+
     def commit(self, record: Round, tokens: Sequence[int], judged: Judged | None = None) -> None:
         self.forwards += 1
         self.tokens += tokens
@@ -254,9 +258,7 @@ class Chunk:
         values.flat[list(self.filled)] = list(self.filled.values())
         return values
 
-    def record(
-        self, actions: np.ndarray, differs: float | None, seconds: float, phases: dict[str, float]
-    ) -> DecodeRecord:
+    def record(self, actions: np.ndarray, seconds: float, phases: dict[str, float]) -> DecodeRecord:
         return DecodeRecord(
             tokens=tuple(self.tokens),
             actions=actions,
@@ -268,7 +270,7 @@ class Chunk:
             phases=phases,
             compensated=self.compensated,
             filled=tuple(self.filled),
-            variability=differs,
+            variability=self.variability,
             skipped=any(one.mode == "skip" for one in self.rounds),
             similarity=self.similarity,
             metric=self.choice.metric if self.choice is not None else None,

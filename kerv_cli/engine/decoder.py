@@ -103,7 +103,7 @@ class Decoder(Follower):
 
     def __init__(self, target: Target, parts: Parts | None = None, chunk: int = 0) -> None:
         super().__init__(target.actions, target.cameras)
-        self.target, self.parts = target, parts or Parts()
+        self.target, self.device, self.parts = target, target.device, parts or Parts()
         self.predicts = target if isinstance(target, PredictsTokens) else None
         self.steps = chunk_steps(chunk, target.chunk)
         self.acceptance: DistanceRule = self.parts.acceptance or StrictRule(target.actions)
@@ -137,7 +137,7 @@ class Decoder(Follower):
 
     @torch.inference_mode()
     def decode(self, observation: Observation) -> DecodeRecord:
-        stopwatch = Stopwatch(self.target.device)
+        stopwatch = Stopwatch(self.device)
 
         def encode() -> Tensor:
             stopwatch.lap("propose")  # time until now was spent by the part that reads the prompt first
@@ -148,11 +148,11 @@ class Decoder(Follower):
         chunk = self.decode_prompt(encode, stopwatch)
         actions = chunk.actions()
         self.last, self.planned = chunk.tokens, [*chunk.values(self.target.chunk)]
-        differs, measure = variability(chunk.rounds, self.space), self.threshold.measure
-        self.threshold.update(differs if measure == MEAN else variability(chunk.rounds, self.space, measure))
+        measure = self.threshold.measure
+        self.threshold.update(chunk.variability if measure == MEAN else variability(chunk.rounds, self.space, measure))
         if self.parts.rectifier is not None:
             self.parts.rectifier.next_decode()
-        record = chunk.record(actions, differs, stopwatch.stop(), stopwatch.phases)
+        record = chunk.record(actions, stopwatch.stop(), stopwatch.phases)
         self.decodes += 1
         if not self.deviation_every or self.decodes % self.deviation_every:
             return record
@@ -167,7 +167,7 @@ class Decoder(Follower):
         Args:
             prompt: The prompt's embeddings (1, P, E), or a function that computes them when they are first needed.
         """
-        stopwatch = stopwatch or Stopwatch(self.target.device)
+        stopwatch = stopwatch or Stopwatch(self.device)
         chunk, skip = self._new_chunk(prompt), self.parts.skip
         stopwatch.lap("propose")
         if skip is not None:
@@ -234,8 +234,8 @@ class Decoder(Follower):
         """
         target, cache = self.target, chunk.target.cache
         first = cache.length
-        positions = torch.arange(first, first + chunk.remaining, device=target.device).split(1)
-        tokens = [upload(chunk.tokens[-1:], target.device)]
+        positions = torch.arange(first, first + chunk.remaining, device=self.device).split(1)
+        tokens = [upload(chunk.tokens[-1:], self.device)]
         for position in positions:
             hidden = target.forward(target.embed(tokens[-1][None]), position, cache)
             tokens.append(target.head(hidden)[0].argmax(-1))
@@ -257,8 +257,8 @@ class Decoder(Follower):
         """Run the target once, over the tokens that are not in its cache yet (first the prompt) and the draft."""
         target, cache, uncached = self.target, chunk.target.cache, chunk.target.uncached(chunk.tokens)
         before = len(uncached) or chunk.target.prompt_length
-        positions, seen = draft.positions(cache.length, before, target.device), draft.visible(before)
-        x = draft.tokens_after(uncached, target.device) if uncached or len(draft) else None
+        positions, seen = draft.positions(cache.length, before, self.device), draft.visible(before)
+        x = draft.tokens_after(uncached, self.device) if uncached or len(draft) else None
         if x is not None and uncached and self.predicts is not None:
             found, hidden = self.predicts.predict(x, positions, cache, seen)
             predicted = found[before - 1 :]
@@ -382,10 +382,7 @@ class BatchDecoder:
                     chunk.commit_token(token)
         for chunk in chunks:
             chunk.episode.last = chunk.tokens
-        return [
-            chunk.record(chunk.actions(), variability(chunk.rounds, self.target.actions), math.nan, dict(UNTIMED))
-            for chunk in chunks
-        ]
+        return [chunk.record(chunk.actions(), math.nan, dict(UNTIMED)) for chunk in chunks]
 
     def _encode(self, observations: Sequence[Observation]) -> list[Tensor]:
         # on a CPU one by one, because kerv's compiled encoders are faster that way; each is (1, P, E)
