@@ -233,7 +233,8 @@ def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
     difficulty = episodes["task"].map(functools.cache(difficulty_of))
     labelled = episodes.assign(difficulty=difficulty).join(runtimes, on="label")
     # strings as Python objects: these frames are cut into hundreds of small ones, and arrow's arrays are slow at that
-    return labelled.assign(**{name: _shared(labelled[name]) for name in labelled.select_dtypes("str")})
+    names = map(str, labelled.select_dtypes("str"))
+    return labelled.assign(**{name: _shared(labelled[name]) for name in names})
 
 
 def _shared(texts: pd.Series) -> pd.Series:
