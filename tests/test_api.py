@@ -122,12 +122,17 @@ def test_a_policy_answers_observations(mine):
     assert np.array_equal(policy.act(seen), actions)
 
 
+def test_an_unknown_study_is_named(tmp_path):
+    swept(tmp_path, threshold_study(["reach-v3"]))
+    with refused("unknown run 'other'"):
+        kerv.load_study("other", results=tmp_path)
+
+
 @pytest.mark.parametrize(
     ("call", "says"),
     [
         (lambda mine: kerv.rollout(**{**mine, "task": "raech"}), "unknown task or suite 'raech': did you mean reach"),
         (lambda mine: kerv.sweep("dmeo", **mine), "unknown study 'dmeo': did you mean demo"),
-        (lambda mine: kerv.load_study("other", results=mine["results"]), "other"),
         (lambda mine: kerv.runs(mine["results"], colour="red"), "unknown filter 'colour'"),
         (lambda mine: kerv.load_policy("absent", results=mine["results"]), "no target 'absent'"),
     ],
