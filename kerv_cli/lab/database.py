@@ -177,7 +177,7 @@ class Database:
 
     def __init__(self, results: str | Path, url: str | sa.URL = "") -> None:
         self.results = results_dir(str(results))
-        url = url or file_url(self.results)
+        url = url or sa.URL.create("sqlite", database=str(self.results.absolute() / FILE))
         try:
             parsed = sa.make_url(url)
         except (sa.exc.ArgumentError, ValueError) as error:
@@ -324,10 +324,6 @@ def clock(connection: sa.Connection) -> sa.ColumnElement[float]:
     if connection.dialect.name == "postgresql":
         return sa.literal_column("CAST(EXTRACT(EPOCH FROM clock_timestamp()) AS double precision)", sa.Double)
     return sa.literal_column("(julianday('now') - 2440587.5) * 86400.0", sa.Double)
-
-
-def file_url(results: Path) -> sa.URL:
-    return sa.URL.create("sqlite", database=str(results.absolute() / FILE))
 
 
 @functools.cache

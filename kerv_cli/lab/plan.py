@@ -107,10 +107,6 @@ class Block:
         return tuple({one.setting.work: one.setting for one in self.episodes}.values())
 
     @property
-    def keys(self) -> list[Key]:
-        return list(map(attrgetter("key"), self.episodes))
-
-    @property
     def seeds(self) -> list[int]:
         return sorted(set(map(attrgetter("seed"), self.episodes)))
 
