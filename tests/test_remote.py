@@ -156,7 +156,7 @@ def test_the_client_adds_at_most_two_milliseconds_to_an_answer():
 
 def test_two_servers_are_two_settings_that_take_turns_and_both_times_are_in_the_table(tmp_path):
     def slow(message):
-        time.sleep(0.02)
+        time.sleep(0.08)
         return straight(message)
 
     (tmp_path / "two.yaml").write_text(
