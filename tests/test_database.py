@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import json
+import os
 import resource
 import signal
 import sqlite3
@@ -207,8 +208,28 @@ def test_an_error_text_and_a_state_that_databases_refuse_are_stored(database):
 
 
 @pytest.mark.parametrize("database", ["postgresql"], indirect=True)
+def test_a_server_that_freezes_is_one_line(database, monkeypatch):
+    monkeypatch.setattr("kerv_cli.lab.postgresql.STATEMENT_SECONDS", 1)
+    monkeypatch.setattr("kerv_cli.lab.postgresql._SPARE_SECONDS", 0)
+    begun(database, "a")
+    frozen = []
+    try:
+        with (
+            refused("no answer for 1 s", "check that the server", error=StorageError),
+            database.reading() as connection,
+        ):
+            frozen.append(connection.scalar(sa.text("SELECT pg_backend_pid()")))
+            os.kill(frozen[0], signal.SIGSTOP)
+            connection.scalar(sa.text("SELECT 1"))
+        assert len(studies(database)) == 1  # over a new connection
+    finally:
+        for pid in frozen:
+            os.kill(pid, signal.SIGCONT)
+
+
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 def test_a_statement_that_takes_too_long_ends(database, monkeypatch):
-    monkeypatch.setattr("kerv_cli.lab.database.STATEMENT_SECONDS", 1)
+    monkeypatch.setattr("kerv_cli.lab.postgresql.STATEMENT_SECONDS", 1)
     with refused("statement timeout", error=StorageError), database.reading() as connection:
         connection.execute(sa.text("SELECT pg_sleep(20)"))
     with refused("refused a statement", "check the rights", error=StorageError), database.reading() as connection:
@@ -217,7 +238,7 @@ def test_a_statement_that_takes_too_long_ends(database, monkeypatch):
 
 @pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 def test_a_suspended_transaction_lets_others_write(database, monkeypatch):
-    monkeypatch.setattr("kerv_cli.lab.database.IDLE_SECONDS", 1)
+    monkeypatch.setattr("kerv_cli.lab.postgresql.IDLE_SECONDS", 1)
     number = sa.select(sa.func.count()).select_from(RUNS)
     with refused("failed", "check that the server runs", error=Unanswered), database.writing() as suspended:
         suspended.execute(sa.text("LOCK TABLE runs"))

@@ -30,11 +30,6 @@ SCHEMA = 2
 """Version of the tables. A database with another version is refused."""
 LOCK_SECONDS = 60
 """Longest time to wait for another process's transaction in a SQLite file, seconds."""
-STATEMENT_SECONDS = 30
-"""Longest time that a statement may take on a server, waiting for other transactions included, seconds."""
-IDLE_SECONDS = 20
-"""Longest time between two statements of a transaction, seconds. A transaction may hold locks for which others wait."""
-CONNECT_SECONDS = 5
 
 _META = sa.MetaData()
 
@@ -328,13 +323,12 @@ def clock(connection: sa.Connection) -> sa.ColumnElement[float]:
 
 @functools.cache
 def _server(url: sa.URL) -> sa.Engine:
-    options = f"-c statement_timeout={STATEMENT_SECONDS}s -c idle_in_transaction_session_timeout={IDLE_SECONDS}s"
-    ends = {"keepalives_idle": 10, "keepalives_interval": 5, "keepalives_count": 2, "tcp_user_timeout": 20_000}
-    limits = {"connect_timeout": CONNECT_SECONDS, "options": options, **ends}
     try:
-        engine = sa.create_engine(url, pool_pre_ping=True, connect_args=limits)
+        from kerv_cli.lab.postgresql import connect
     except ModuleNotFoundError:
         raise UsageError("store=postgresql:// needs the package psycopg: pip install 'kerv[postgres]'") from None
+    engine = sa.create_engine(url, pool_pre_ping=True)
+    sa.event.listen(engine, "do_connect", connect)
     sa.event.listen(engine, "begin", _begin)
     return engine
 
