@@ -1,1 +1,1 @@
-"""Lists the contents of a results folder, runs stored studies again, and imports studies from elsewhere."""
+"""Lists the contents of a results folder, and compares what it holds."""
