@@ -188,12 +188,10 @@ def work_of(rounds: Columns, counts: np.ndarray, phases: Columns, looked_up: np.
     def calls(chosen: np.ndarray, rows: np.ndarray, with_prompt: np.ndarray | bool = False) -> Calls:
         return Calls(decode[chosen], rows[chosen], np.broadcast_to(with_prompt, rows.shape)[chosen])
 
-    def rounds_of(chosen: np.ndarray) -> dict[str, Calls]:
-        drafted, drawn = chosen & drafts & ~trees, chosen & trees
+    def drafted_in(chosen: np.ndarray) -> dict[str, Calls]:
         return {
-            "verify": calls(chosen & forward & ~prefill, 1 + nodes),
-            DRAFTING: calls(drafted, nodes),
-            "tree": calls(drawn, np.minimum(levels, size - start - 1)),
+            DRAFTING: calls(chosen & drafts & ~trees, nodes),
+            "tree": calls(chosen & trees, np.minimum(levels, size - start - 1)),
         }
 
     verifies = np.flatnonzero(forward & ~prefill)
@@ -203,8 +201,9 @@ def work_of(rounds: Columns, counts: np.ndarray, phases: Columns, looked_up: np.
     found = {
         "encode": Calls(encoded, np.ones(len(encoded), int), np.zeros(len(encoded), bool)),
         "prefill": calls(forward & prefill, nodes, True),
+        "verify": calls(forward & ~prefill, 1 + nodes),
         "feed": calls(feeds, accepted + ~prefill, prefill),
-        **rounds_of(np.ones(len(decode), bool)),
+        **drafted_in(np.ones(len(decode), bool)),
     }
     sources: dict[str, np.ndarray] = {}
     for kind, names in costs.items():
@@ -216,7 +215,11 @@ def work_of(rounds: Columns, counts: np.ndarray, phases: Columns, looked_up: np.
         sources={kind: drafted for kind, drafted in sources.items() if drafted.any()},
         host=phases["accept"] + phases["rectify"] + phases["other"],
         propose=np.where(has_drafter, 0.0, phases["propose"]),
-        again={**rounds_of(first), "feed": calls(first & has_drafter[decode], accepted + 1)},
+        again={
+            "verify": calls(first, 1 + nodes),
+            "feed": calls(first & has_drafter[decode], accepted + 1),
+            **drafted_in(first),
+        },
     )
 
 
