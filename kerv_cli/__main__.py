@@ -26,7 +26,7 @@ _is_interrupted = False
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt. The second time, end at once: the database rolls back, and locks are free.
+    """Raise KeyboardInterrupt. On a second interrupt, end at once: the database rolls back, and locks are free.
 
     Also end at once while a module is loading: if C++ code runs Python, an exception there aborts the process.
     """

@@ -1,5 +1,6 @@
 """Policies behind a server: the same as in this process, the official client's encoding, two settings, every fault."""
 
+import csv
 import os
 import re
 import socket
@@ -183,6 +184,8 @@ def test_two_servers_are_two_settings_that_take_turns_and_both_times_are_in_the_
     assert table["unverified_share"].isna().all()
     assert table.loc["real", "felt_latency_ms"] > 0
     assert "of it the" in " ".join(told("report", "study=two", f"results={tmp_path}", "--all").split())
+    rows = csv.DictReader((tmp_path / "report/tables/two.csv").read_text().splitlines())
+    assert all(float(row["server_ms"]) == 1.5 and float(row["answer_ms"]) > 0 for row in rows)
     board = client_of(tmp_path)
     first = re.findall(r"/episodes/\d+", board.get("/studies/two/episodes").text)[0]
     assert "policy&#39;s server" in board.get(first).text

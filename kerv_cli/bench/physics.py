@@ -60,7 +60,7 @@ class Engine:
     """How a program executes a decode.
 
     A phase takes its floor (shortest time that the device allows) ÷ `share`, or the time of launching its kernels if
-    that is longer. The system time is added.
+    that is longer. The time of the surrounding program (`system`) is added.
     """
 
     name: str

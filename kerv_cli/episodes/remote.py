@@ -150,7 +150,7 @@ class Server:
         raise EpisodeError(f"{self.url} gave no answer within {ANSWER_S:g} s")
 
     def accounts(self, answer: Message) -> Served:
-        """Return the server's own time for an answer, and what was accepted since the last one."""
+        """Return the server's own time for this answer, and the tokens accepted since the previous one."""
         seconds = math.nan
         for key in ("server_timing", "policy_timing"):
             timing = answer.get(key)

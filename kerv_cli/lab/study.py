@@ -125,7 +125,7 @@ def plan(
 
 
 def _check_source(study: Study, command: Sequence[str]) -> None:
-    """Refuse a sweep whose file has the name of a study that another file describes. A file may have moved."""
+    """Refuse a sweep if another file, which still exists, already describes a study of this name."""
     ours, theirs = (
         next((word.partition("=")[2] for word in words if word.startswith("study=")), "")
         for words in (command, swept_by(study))
@@ -179,10 +179,10 @@ def _earlier(connection: sa.Connection, labels: Sequence[str]) -> dict[str, Sett
 def save(plan: Plan, run: str = "") -> None:
     """Write a plan, in one transaction: the study's settings, its rows, and the blocks of what must run.
 
-    If nobody else runs the study, rows outside the plan are removed or lose their block. A row of another task stays if
-    its setting and the baseline are unchanged, and this plan has its seed: so sweeps over different tasks give one
-    report. If somebody runs the study, nothing is taken away, and new rows get blocks of their own. A row that finished
-    after planning keeps its episode.
+    If nobody else runs the study, rows outside the plan are removed, or not asked for any more. Sweeps over different
+    tasks give one report: rows of another task stay if their setting, the baseline and their seed are in the plan. If
+    somebody runs the study, nothing is taken away, and new rows get blocks of their own. A row that finished after
+    planning keeps its episode.
 
     Args:
         plan: The plan.

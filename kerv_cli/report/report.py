@@ -155,7 +155,8 @@ def write_study(data: StudyData, loss: float, profiles: Sequence[NamedProfile] =
 
 def csv_rows(data: StudyData, results: Sequence[Result]) -> list[Row]:
     first, others = CSV_COLUMNS[: CSV_COLUMNS.index("overrides") + 1], CSV_COLUMNS
-    names = dict.fromkeys([*first, *data.varied, *others])
+    served = any(result.measures.server_ms > 0 for result in results)
+    names = dict.fromkeys([*first, *data.varied, *others, *(("answer_ms", "server_ms") if served else ())])
     rows = []
     for result in results:
         values = result.columns()

@@ -174,7 +174,7 @@ def over_runs(estimates: Sequence[Estimate], same_pairs: bool) -> Estimate:
 
     The 95 % interval is computed for the logarithm, by Student's t with k − 1 degrees of freedom. If all runs have the
     same pairs, their spread does not show how much the choice of pairs matters. Then the mean of the runs' half widths
-    is added in quadrature.
+    is added to this half width, in quadrature.
 
     Args:
         same_pairs: Whether all runs measured the same pairs. If not, each run has its own seeds.

@@ -225,10 +225,7 @@ def _parts(rows: Sequence[Cells], names: Sequence[str], width: int) -> Iterator[
 
 
 def not_in_turn(results: Sequence[Result]) -> list[str]:
-    """Return the labels of the settings that were timed but have no speedup.
-
-    The two episodes of each of their pairs did not run side by side in one process (a block).
-    """
+    """Return the labels of timed settings without a speedup: none of their episodes ran in one block with its pair."""
     apart: dict[str, None] = {}
     for row in results:
         of = row.measures

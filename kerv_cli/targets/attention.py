@@ -52,8 +52,8 @@ class Cache:
         """Return the memory in which compiled programs keep copies of keys and values, in panels.
 
         Returns:
-            The keys (layers, B · A, panels, C, width), the values (layers, B · A, panels, slots, width), and the number
-                of slots, from the first on, that these arrays hold already.
+            The keys (layers, B · A, panels, C, width), the values (layers, B · A, panels, slots, width), and how many
+                leading slots are filled.
         """
         if self._copies is None:
             layers, _, batch, heads, slots, channels = self.buffer.shape

@@ -101,7 +101,7 @@ class DrafterTraining:
 
 
 def plan_drafter(settings: TrainDrafterSettings, database: Database) -> Plan[tuple[Path, Metrics]]:
-    """Check the training of a drafter. Its work returns the drafter's folder and the metrics of the best weights.
+    """Plan the training of a drafter. The plan, when executed, returns its folder and the best weights' metrics.
 
     The target decodes in `runtime.dtype`. The drafter is trained in float32. An interrupted training goes on.
     """

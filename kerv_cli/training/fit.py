@@ -248,7 +248,7 @@ def identity_of(train: TrainSettings, dataset: DemoDataset, **own: Any) -> str:
 
 @dataclass(frozen=True)
 class Destination:
-    """Where a training is made: in its folder, or beside the weights there, which it replaces once it is complete."""
+    """Where a training is made: in its own folder, or in a temporary one that replaces older weights on completion."""
 
     folder: Path
     identity: str
@@ -270,7 +270,7 @@ class Destination:
 
     @contextmanager
     def opened(self) -> Iterator[Path]:
-        """Yield the folder to train in. If it is not `self.folder`, it replaces that one after the block."""
+        """Yield the folder to train in. A temporary one replaces `self.folder` when the `with` block ends."""
         new = unfinished(self.folder)
         in_place = not visible(self.folder) or (self.begun and self._resumes(self.folder))
         if not self.replace or (in_place and not new.exists()):

@@ -248,8 +248,8 @@ class EagleDrafter(TrainableDrafter):
     ) -> tuple[Tensor, Metrics]:
         """Return the loss and the metrics to log, for B examples with prompts of one length.
 
-        The first pass reads the target's hidden states, later passes the drafter's predictions of the pass before, as
-        in drafting. A pass's loss is the weighted sum of the smooth L1 loss of the states and the cross-entropy of the
+        The first pass reads the target's hidden states. Later passes read the drafter's own predictions, as drafting
+        does. A pass's loss is the weighted sum of the smooth L1 loss of the states and the cross-entropy of the
         drafter's token distribution with the target's. The result is the mean over passes.
         """
         device = target.device

@@ -116,7 +116,7 @@ class Matrix:
     Attributes:
         values: (panels, inputs, PANEL) weights.
         factors: (panels, 2, PANEL) scale and bias of every output.
-        columns: Entries of an operation in the table of operations (`recording.COLUMNS`).
+        columns: What the table of operations holds for this matrix, by column (`recording.COLUMNS`).
         blocked: The matrix in oneDNN's layout, without panels. None if the matrix is stored in panels.
     """
 
