@@ -55,7 +55,7 @@ def test_only_what_a_dead_process_left_is_left_over(tmp_path, dead):
     folder = of_process(tmp_path / "cell", dead)
     folder.mkdir(parents=True)
     (folder / theirs.name).touch()
-    assert clean(tmp_path) == sorted([theirs, folder])  # what lies in a left folder goes with it
+    assert clean(tmp_path) == sorted([theirs, folder])  # a left-over folder goes with its content
     assert not folder.exists()
     assert mine.exists()
 

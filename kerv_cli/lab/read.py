@@ -200,8 +200,8 @@ def whole_runs(study: Study) -> list[str]:
 def frame_of(study: Study, episodes: Iterable[Episode] | None = None, run: str | None = None) -> pd.DataFrame:
     """Return the episodes that have been run, in the study's order: one row per label, task and seed.
 
-    Its columns are those of the table `episodes`, with `decode_seconds` as an array and `initial_state` as a tuple,
-    `run`, and the machine and versions that ran the episode.
+    It has the columns of the table `episodes` (`decode_seconds` as an array, `initial_state` as a tuple), `run`, and
+    the machine and versions that ran the episode.
 
     Args:
         episodes: Only these episodes; None for all.

@@ -389,7 +389,7 @@ class EpisodeRunner:
 
 
 def _loaded(setting: Setting, tasks: list[str], load: Callable[[], T]) -> T:
-    """Return what a function loads. The weights on the disk are those of the plan, before and after."""
+    """Call `load`. Refuse weights on the disk that differ from the plan's, before or after the call."""
     results = str(setting.settings["results"])
     checked(setting, tasks, results, is_awaited=True)
     loaded = load()

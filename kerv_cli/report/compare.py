@@ -13,7 +13,7 @@ from kerv_cli.catalogue.entries import RunEntry, description_of, find_run, store
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Setting, without
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.plan import seeds_text
-from kerv_cli.lab.read import decodes_of, frame_of, loaded
+from kerv_cli.lab.read import decodes_of, loaded
 from kerv_cli.report.measures import Row
 from kerv_cli.report.tables import StudyData, differences, flatten, load_study, split_values
 
@@ -128,8 +128,7 @@ def _same_tokens(first: ComparedRun, second: ComparedRun) -> str:
 
 def _tokens(side: ComparedRun) -> pd.DataFrame:
     assert side.data is not None
-    frame = frame_of(side.data.study)
-    frame = frame[frame["label"] == side.label][["episode", "task", "seed"]].reset_index(drop=True)
+    frame = side.episodes[["episode", "task", "seed"]].reset_index(drop=True)
     # `episode` of the decodes is a position in the list
     decodes = decodes_of(side.data.study, frame["episode"].tolist(), ["tokens"]).to_pandas()
     tokens = decodes.groupby("episode")["tokens"].agg(lambda rows: tuple(map(tuple, rows)))

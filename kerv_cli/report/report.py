@@ -139,7 +139,7 @@ def write_study(data: StudyData, loss: float, profiles: Sequence[NamedProfile] =
     """
     priced = repriced(data, profiles) if profiles else repriced(data, own_profiles(data), lenient=True)
     tables = {"": csv_rows(data, data.results), "_per_task": csv_rows(data, data.task_results)}
-    tables |= {"_on": prices_table(priced)}
+    tables["_on"] = prices_table(priced)
     report, folder = Report(data, loss, priced), data.study.database.results / "report" / "tables"
     for suffix, rows in tables.items():
         if rows:

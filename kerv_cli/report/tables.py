@@ -61,7 +61,7 @@ class StudyData:
     """A study (settings that are compared) with its stored episodes. Tables are computed on first use and then kept."""
 
     study: Study
-    # one row per stored episode. Columns: those of `Study.frame`, difficulty, device, number format, threads.
+    # one row per stored episode. Columns as in `frame_of`, then difficulty, device, number format, threads.
     episodes: pd.DataFrame
     # one table like `episodes` per run (command), all of the same code on the same kind of device. Empty if there are
     # fewer than three.

@@ -25,9 +25,9 @@ class Choice:
 
     pairs: int  # number of pairs of the setting with the most pairs
     baseline_success: float  # success rate of the baseline
-    # fastest setting that is shown to lose less success than the reader accepts. Empty if there is none.
+    # label of the fastest setting whose loss of success is shown to be acceptable; empty: no setting
     chosen: str = ""
-    # if no setting is chosen, the fastest that would be after more pairs, at these rates. Empty if there is none.
+    # without a choice: label of the fastest setting that more pairs at these rates would choose; empty: no setting
     candidate: str = ""
     # about how many pairs in all would let the candidate be chosen. NaN without a candidate.
     candidate_pairs: float = math.nan

@@ -152,4 +152,4 @@ def grow(settings: BuildTargetSettings, folder: Path) -> dict[str, Any]:
     grown = {**description.settings, "grown": asdict(recipe)}
     write_json(folder / "target.json", asdict(replace(description, family="grown", settings=grown, sha256=digest)))
     weights = sum(p.numel() for p in target.trunk.layers.parameters() if p.dim() == 2)
-    return {"weights": weights, "those of the policy": description.provenance.get("parameters", 0)}
+    return {"weights": weights, "weights of the policy": description.provenance.get("parameters", 0)}

@@ -19,6 +19,7 @@ from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_tasks, demos_for
 from kerv_cli.training.fit import (
+    FEW,
     Destination,
     Loss,
     Metrics,
@@ -33,8 +34,7 @@ from kerv_cli.training.settings import Plan, Stage, TrainDrafterSettings
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
-FEW = 4  # episodes on which `--plan` measures the time of decodes and steps
-SAMPLES = 64  # decodes of which it measures the time
+SAMPLES = 64  # decodes of which `--plan` measures the time
 
 
 @dataclass(frozen=True)

@@ -299,6 +299,9 @@ class Destination:
             return "", 0  # without replace=true, reading the whole state says what is damaged
 
 
+FEW = 4  # episodes from which `--plan` makes the samples to measure
+
+
 def seconds_of(loss: Loss, settings: TrainSettings, device: torch.device) -> float:
     """Estimate how long all steps of a training take, from three of them. The first one counts as warm-up."""
     times = []

@@ -38,6 +38,7 @@ from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.training.demonstrations import check_spaces, check_tasks, name_of, open_demos, seen_by
 from kerv_cli.training.fit import (
+    FEW,
     Destination,
     Loss,
     Metrics,
@@ -60,7 +61,6 @@ WITHIN = 9
 # Positions that a policy estimates if its demonstrations hold no object positions: where the hand will be when the
 # gripper next changes, and at the end of the episode. No state contains them, so their index 0 is never used.
 WAYPOINTS = (Place("waypoint 1", 0), Place("waypoint 2", 0))
-FEW = 4  # episodes on which `--plan` measures the time of a step
 VALIDATED = 2048  # maximum number of samples in a validation
 
 
