@@ -720,10 +720,14 @@ def test_workers_that_cannot_begin_end_the_sweep_in_one_line(tmp_path, monkeypat
 ])  # fmt: skip
 def test_each_local_worker_sees_one_gpu(visible, device, seen, tmp_path, monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
-    store = waiting(opened(tmp_path), STUDY)
+    plan = planned(opened(tmp_path), STUDY)
+    for setting in plan.study.settings:
+        setting.settings["runtime"] |= {"device": device}
+    store = plan.study
+    save(plan)
     script = f'echo "$CUDA_VISIBLE_DEVICES" > {tmp_path}/gpu$$; sleep 60'
     monkeypatch.setattr(sys, "executable", str(shell(tmp_path, "python", script)))
-    with LocalWorkers(store.database, store.name, "", 3, dict(os.environ), gpus_in_turn(device)):
+    with LocalWorkers(store.database, store.name, "", 3, dict(os.environ), gpus_in_turn(plan)):
         until(lambda: sum(path.stat().st_size > 0 for path in tmp_path.glob("gpu*")) == 3)
     found = [path.read_text().strip() for path in tmp_path.glob("gpu*")]
     assert {one: found.count(one) for one in found} == seen

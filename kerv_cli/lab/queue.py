@@ -15,11 +15,23 @@ import sqlalchemy as sa
 
 from kerv_cli.base.errors import KervError, StorageError
 from kerv_cli.episodes.identity import Setting
-from kerv_cli.lab.database import PLANNED, RUNS, SETTINGS, STUDIES, UNFINISHED, WANTED, WORKERS, Unanswered
+from kerv_cli.lab.database import (
+    BLOCKS,
+    DECODES,
+    EPISODES,
+    PLANNED,
+    RUNS,
+    SETTINGS,
+    STUDIES,
+    UNFINISHED,
+    WANTED,
+    WORKERS,
+    Unanswered,
+)
 from kerv_cli.lab.plan import Block, Episode
 from kerv_cli.lab.presence import beats
-from kerv_cli.lab.read import setting_of, stored_episodes
-from kerv_cli.lab.store import ROLLOUT, Study, write_episode
+from kerv_cli.lab.read import IS_NO_ROLLOUT, RAN, setting_of
+from kerv_cli.lab.store import ROLLOUT, Study
 
 T = TypeVar("T")
 
@@ -80,13 +92,19 @@ class Queue:
             if not rows:
                 return None
             settings = self._settings_of(connection, rows)
-            rows = self._whole_orders(connection, rows, settings)
-            linked = self._link(connection, rows, settings)
+            ordered = [number for number in {row.setting_id for row in rows} if settings[number].depends_on_order]
+            if ordered:  # if the block was begun, they run again from its first episode on
+                begun = WANTED.c.study_id == self.number, WANTED.c.block == rows[0].block
+                again = sa.update(WANTED).where(*begun, WANTED.c.setting_id.in_(ordered), WANTED.c.error.is_(None))
+                values = {"worker": self.worker, "episode_id": None, "attempts": 0}
+                again = again.where(WANTED.c.episode_id.is_not(None)).values(**values)
+                rows = [*rows, *connection.execute(again.returning(WANTED)).all()]
+            linked = self._link(connection, ordered)
             run = self.run or connection.scalar(self._newest_run()) or ""
         episodes, deadly = dict[Any, Episode](), None
         for row in sorted(rows, key=lambda row: row.position):
             one = Episode(settings[row.setting_id], row.task, row.seed)
-            if one.key not in linked:
+            if (row.setting_id, row.task, row.seed) not in linked:
                 one = episodes.setdefault(one.key, one)
                 deadly = one if row.attempts >= MOST_DEATHS else deadly
         return Claim(run, Block(tuple(episodes.values())), deadly)
@@ -128,33 +146,15 @@ class Queue:
                 self._settings[one.id] = replace(setting, settings=plain)
         return self._settings
 
-    def _whole_orders(
-        self, connection: sa.Connection, rows: Sequence[Any], settings: Mapping[int, Setting]
-    ) -> Sequence[Any]:
-        """Claim also the finished rows of a setting whose results depend on the order, if its block was begun."""
-        ordered = [number for number in {row.setting_id for row in rows} if settings[number].depends_on_order]
-        if not ordered:
-            return rows
-        begun = WANTED.c.study_id == self.number, WANTED.c.block == rows[0].block, WANTED.c.setting_id.in_(ordered)
-        again = sa.update(WANTED).where(*begun, WANTED.c.episode_id.is_not(None), WANTED.c.error.is_(None))
-        values = {"worker": self.worker, "episode_id": None, "attempts": 0}
-        return [*rows, *connection.execute(again.values(**values).returning(WANTED)).all()]
-
-    def _link(self, connection: sa.Connection, rows: Sequence[Any], settings: Mapping[int, Setting]) -> set[Any]:
-        """Link rows to episodes that other studies have stored. Return the keys of these episodes."""
-        ready = [row for row in rows if not row.anew and not settings[row.setting_id].depends_on_order]
-        if not ready:
-            return set()
-        works = {settings[row.setting_id].work for row in ready}
-        tasks, seeds = {row.task for row in ready}, {row.seed for row in ready}
-        stored, linked = stored_episodes(connection, self.study.kind, works, tasks, seeds), set()
-        for row in ready:
-            key = settings[row.setting_id].work, row.task, row.seed
-            if found := stored.get(key):
-                own = {name: getattr(row, name) for name in ("setting_id", "task", "seed")}
-                connection.execute(sa.update(WANTED).filter_by(**own).values(episode_id=found[-1].id))
-                linked.add(key)
-        return linked
+    def _link(self, connection: sa.Connection, ordered: Sequence[int]) -> set[Any]:
+        """Link claimed rows to episodes that other studies have stored. Return the keys of these rows."""
+        same = EPISODES.c.work == SETTINGS.c.work, EPISODES.c.task == WANTED.c.task, EPISODES.c.seed == WANTED.c.seed
+        newest = sa.select(sa.func.max(EPISODES.c.id)).select_from(RAN.join(SETTINGS, sa.true()))
+        newest = newest.where(SETTINGS.c.id == WANTED.c.setting_id, *same, IS_NO_ROLLOUT).correlate(WANTED)
+        mine = WANTED.c.worker == self.worker, self._of_study, ~WANTED.c.anew, WANTED.c.setting_id.not_in(ordered)
+        found = sa.update(WANTED).where(*mine).values(episode_id=newest.scalar_subquery())
+        rows = connection.execute(found.returning(WANTED)).all()
+        return {(row.setting_id, row.task, row.seed) for row in rows if row.episode_id is not None}
 
     def _rows(self, one: Episode) -> sa.ColumnElement[bool]:
         ids = [number for number, setting in self._settings.items() if setting.work == one.setting.work]
@@ -192,8 +192,13 @@ class Queue:
             then: The episode that begins now. None if there is none.
         """
         with self.database.writing() as connection:
-            # it is there already if it was committed, but the answer was lost
-            number = write_episode(connection, one.key, block, row, decodes)
+            own = dict(zip(("work", "task", "seed"), one.key, strict=True)) | {"block": block["id"]}
+            number = connection.scalar(sa.select(EPISODES.c.id).filter_by(**own))
+            if number is None:  # otherwise it was committed, but the answer was lost
+                if connection.scalar(sa.select(BLOCKS.c.id).filter_by(id=block["id"])) is None:
+                    connection.execute(sa.insert(BLOCKS).values(**block))
+                number = connection.scalar(sa.insert(EPISODES).values({**row, **own}).returning(EPISODES.c.id))
+                connection.execute(sa.insert(DECODES).values(episode_id=number, parquet=decodes))
             is_mine = sa.or_(WANTED.c.episode_id.is_(None), WANTED.c.episode_id == number)
             self._change(connection, one, is_mine, episode_id=number, error=None, attempts=0, anew=False)
             if then is not None:
@@ -205,13 +210,10 @@ class Queue:
             for one in episodes:
                 self._change(connection, one, sa.true(), error=error, attempts=0)
 
-    def left(self) -> tuple[int, int]:
-        """Return the number of unfinished rows of the study, and how many of these are free for this worker."""
+    def left(self) -> int:
+        """Return the number of unfinished rows of the study."""
         with self.database.reading() as connection:
-            free = sa.case((self._is_free(self._others(connection)), 1), else_=0)
-            query = sa.select(sa.func.count(), sa.func.coalesce(sa.func.sum(free), 0)).where(self._of_study)
-            waiting, number = connection.execute(query).one()
-        return int(waiting), int(number)
+            return connection.scalar(sa.select(sa.func.count()).select_from(WANTED).where(self._of_study)) or 0
 
 
 def patiently(action: Callable[..., T], *arguments: Any) -> T:

@@ -23,7 +23,6 @@ from kerv_cli.lab.database import (
     RUNS,
     SETTINGS,
     STUDIES,
-    UNFINISHED,
     WANTED,
     Damaged,
     Database,
@@ -120,40 +119,25 @@ def setting_of(row: Any) -> Setting:
 
 def rows_of(connection: sa.Connection, name: str) -> Sequence[Any]:
     """Return the rows of a study in the table WANTED, each with the label and the hash of its setting."""
-    columns = SETTINGS.c.label, SETTINGS.c.work, WANTED, sa.case((UNFINISHED, True), else_=False).label("is_unfinished")
-    query = sa.select(*columns).select_from(PLANNED).where(STUDIES.c.name == name).order_by(WANTED.c.position)
+    query = sa.select(SETTINGS.c.label, SETTINGS.c.work, WANTED).select_from(PLANNED)
+    query = query.where(STUDIES.c.name == name).order_by(WANTED.c.position)
     return connection.execute(query).all()
 
 
-def stored_episodes(
-    connection: sa.Connection, kind: str, works: Iterable[str], tasks: Iterable[str] = (), seeds: Iterable[int] = ()
-) -> dict[Key, list[StoredEpisode]]:
-    """Return the stored episodes that a study may reuse, by `Episode.key`, each list with the oldest first.
+RAN = EPISODES.join(BLOCKS).outerjoin(RUNS, RUNS.c.id == BLOCKS.c.run)
+"""Each stored episode with the command that ran it."""
+IS_NO_ROLLOUT = sa.func.coalesce(RUNS.c.kind, "") != ROLLOUT
+"""Condition: a sweep may use the episode. In a rollout no other setting took turns with it."""
 
-    Sweeps do not reuse episodes of rollouts: no other setting took turns with them, so their times cannot be compared.
 
-    Args:
-        connection: The database.
-        kind: Kind of the study.
-        works: Hashes of the settings.
-        tasks: Only episodes of these tasks; empty for all.
-        seeds: Only episodes with these seeds; empty for all.
-    """
-    columns = EPISODES.c["work", "task", "seed", "id"], BLOCKS.c["id", "started", "seeds"]
-    query = sa.select(*columns[0], *columns[1]).join(BLOCKS, EPISODES.c.block == BLOCKS.c.id)
-    wanted: dict[Any, set[Any]] = {
-        EPISODES.c.work: set(works),
-        EPISODES.c.task: set(tasks),
-        EPISODES.c.seed: set(seeds),
-    }
-    for column, values in wanted.items():
-        if values:
-            query = query.where(column.in_(values))
-    if kind != ROLLOUT:
-        query = query.outerjoin(RUNS, RUNS.c.id == BLOCKS.c.run)
-        query = query.where(sa.func.coalesce(RUNS.c.kind, "") != ROLLOUT)
+def stored_episodes(connection: sa.Connection, study: Study) -> dict[Key, list[StoredEpisode]]:
+    """Return the stored episodes that a study may reuse, by `Episode.key`, each list with the oldest first."""
+    works = EPISODES.c.work.in_({setting.work for setting in study.settings})
+    columns = *EPISODES.c["work", "task", "seed", "id"], *BLOCKS.c["id", "started", "seeds"]
+    query = sa.select(*columns).select_from(RAN).where(works).order_by(EPISODES.c.id)
+    query = query if study.kind == ROLLOUT else query.where(IS_NO_ROLLOUT)
     stored: dict[Key, list[StoredEpisode]] = {}
-    for work, task, seed, *row in connection.execute(query.order_by(EPISODES.c.id)):
+    for work, task, seed, *row in connection.execute(query):
         stored.setdefault((work, task, seed), []).append(StoredEpisode(*row))
     return stored
 

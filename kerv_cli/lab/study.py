@@ -22,12 +22,12 @@ from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.episodes import policy
 from kerv_cli.episodes.identity import Setting
 from kerv_cli.episodes.resolve import ResolvedStudy, located
-from kerv_cli.lab.database import EPISODES, SETTINGS, STUDIES, UNFINISHED, WANTED, Database
+from kerv_cli.lab.database import EPISODES, RUNS, SETTINGS, STUDIES, UNFINISHED, WANTED, Database, now
 from kerv_cli.lab.plan import ALL, NEVER, Block, Episode, all_episodes, blocks_of, ordered_parts, split
 from kerv_cli.lab.presence import living
 from kerv_cli.lab.read import counts_of, is_stored, rows_of, setting_of, stored_episodes, swept_by
-from kerv_cli.lab.runs import interrupted, running
-from kerv_cli.lab.store import ABOUT, SWEEP, Study, save_settings, study_row
+from kerv_cli.lab.runs import interrupted
+from kerv_cli.lab.store import ABOUT, SWEEP, Study
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,16 +63,11 @@ class Plan:
         return blocks_of(self.to_run, self.study.block, self.runtime.workers or 1)
 
     @property
-    def device(self) -> str:
-        devices = {str(one.setting.settings["runtime"]["device"]) for one in self.to_run}
-        return devices.pop() if len(devices) == 1 else ""
-
-    @property
     def is_elsewhere(self) -> bool:
-        return _is_elsewhere(self.runtime)
+        return is_elsewhere(self.runtime)
 
 
-def _is_elsewhere(runtime: RuntimeSettings) -> bool:
+def is_elsewhere(runtime: RuntimeSettings) -> bool:
     return bool(runtime.launch) or not runtime.workers
 
 
@@ -82,12 +77,12 @@ def check(resolved: ResolvedStudy) -> tuple[Setting, ...]:
     settings = []
     for label, one in resolved.settings.items():
         point, device = resolved.points[label], one.runtime.device
-        if _is_elsewhere(resolved.first.runtime):  # this machine may have no GPU
+        if is_elsewhere(resolved.first.runtime):  # this machine may have no GPU
             if device == "auto":
                 raise UsageError("runtime.device=auto: workers run elsewhere, name their device: cpu or cuda")
             one.runtime.device = "cpu"
         identity = policy.check(one)
-        one.runtime.device = device if _is_elsewhere(resolved.first.runtime) else set_up(one.runtime)[0]
+        one.runtime.device = device if is_elsewhere(resolved.first.runtime) else set_up(one.runtime)[0]
         plain = asdict(one)
         del plain["task"]
         settings.append(Setting(label, point.words, plain, identity, point.varies, point.name))
@@ -163,7 +158,7 @@ def plan_study(
             setting = of_label.get(row.label)
             if setting is not None and setting.work == row.work:
                 known[Episode(setting, row.task, row.seed)] = row
-        stored = stored_episodes(connection, study.kind, {setting.work for setting in study.settings})
+        stored = stored_episodes(connection, study)
         earlier = _earlier(connection, study.labels)
     existing, missing = split(study.episodes, study.block, stored, known, rerun, earlier)
     seen = frozenset(row.episode_id for row in known.values() if row.episode_id is not None)
@@ -188,92 +183,96 @@ def save(plan: Plan, run: str = "") -> None:
         plan: The plan.
         run: Id of this command.
     """
-    with plan.study.database.writing() as connection:
-        save_in(connection, plan, run)
-
-
-def save_in(connection: sa.Connection, plan: Plan, run: str = "") -> int:
-    """Do the same as `save`, but in the caller's transaction. Return the study's row number."""
     study = plan.study
-    is_shared = _somebody_runs(connection, study, run)
-    number, is_same_baseline = study_row(connection, study)
-    ids = save_settings(connection, study, number, is_shared, is_same_baseline)
-    before = {(row.setting_id, row.task, row.seed): row for row in rows_of(connection, study.name)}
-    works = {setting.work for setting in study.settings}
-    stored = set(connection.scalars(sa.select(EPISODES.c.id).where(EPISODES.c.work.in_(works))))
-    wanted = {(ids[one.setting.label], one.task, one.seed): one for one in study.episodes}
-    new, changed, moved = list[Any](), list[Any](), list[Any]()
-    to_run = dict[Episode, dict[str, Any]]()
-    positions = _positions(wanted, before)
-    for key, one in wanted.items():
-        row, linked = before.pop(key, None), plan.existing.get(one)
-        of_key = dict(zip(_KEY, key, strict=True))
-        if row is not None and _stays(row, linked, plan, is_shared):
-            if row.position != positions[key]:
-                moved.append({f"of_{name}": value for name, value in (of_key | {"position": positions[key]}).items()})
-            continue
-        values = {**of_key, "study_id": number, "position": positions[key], "error": None, "block": None,
-                  "episode_id": linked if linked in stored else None, "worker": None, "attempts": 0,
-                  "anew": plan.anew or (row is not None and row.anew)}  # fmt: skip
-        if values["episode_id"] is None:
-            to_run[one] = values
-        (new if row is None else changed).append(values)
-    _check_orders(study, to_run, is_shared)
-    last = connection.scalar(sa.select(sa.func.max(WANTED.c.block)).where(WANTED.c.study_id == number)) or 0
-    by_key = {one.key: one for one in to_run}
-    blocks = blocks_of(by_key.values(), study.block, plan.runtime.workers or 1)
-    block_of = {one.key: last + 1 + index for index, block in enumerate(blocks) for one in block.episodes}
-    for one, values in to_run.items():
-        values["block"] = block_of[one.key]
-    if not is_shared:
-        _take_away(connection, study, ids, before.values())
-    if new:
-        connection.execute(sa.insert(WANTED), new)
-    if changed:
-        rows = [{f"of_{name}": row[name] for name in (*_KEY, *_VALUES)} for row in changed]
-        connection.execute(_update(*_VALUES), rows)
-    if moved:
-        connection.execute(_update("position"), moved)
-    return number
+    with study.database.writing() as connection:
+        alive = living(study.database, connection)
+        mine = WANTED.join(STUDIES, WANTED.c.study_id == STUDIES.c.id)
+        claimed = sa.select(WANTED.c.worker).select_from(mine)
+        claimed = claimed.where(STUDIES.c.name == study.name, UNFINISHED, WANTED.c.worker.in_(alive))
+        others = sa.or_(_other_commands(study, alive, run), claimed.exists())
+        is_shared = bool(connection.scalar(sa.select(others)))
+        number, ids = _save_settings(connection, study, is_shared)
+        before = {_key(row): _values(row) for row in rows_of(connection, study.name)}
+        wanted = {(ids[one.setting.label], one.task, one.seed): one for one in study.episodes}
+        after = {key: row for key, row in before.items() if key not in wanted}
+        if not is_shared:
+            after = _still_asked_for(after, wanted)
+        first = max((row["position"] for row in after.values()), default=0) + 1
+        works = {setting.work for setting in study.settings}
+        stored = set(connection.scalars(sa.select(EPISODES.c.id).where(EPISODES.c.work.in_(works))))
+        to_run = dict[Episode, dict[str, Any]]()
+        for position, (key, one) in enumerate(wanted.items(), first):
+            row, linked = before.get(key), plan.existing.get(one)
+            if row is not None and _stays(row, linked, plan, is_shared):
+                after[key] = row | {"position": position}
+                continue
+            after[key] = dict(zip(_KEY, key, strict=True)) | {
+                "study_id": number, "position": position, "episode_id": linked if linked in stored else None,
+                "error": None, **_NOBODYS, "anew": plan.anew or (row is not None and row["anew"]),
+            }  # fmt: skip
+            if after[key]["episode_id"] is None:
+                to_run[one] = after[key]
+        if is_shared:
+            _check_orders(study, to_run)
+        last = connection.scalar(sa.select(sa.func.max(WANTED.c.block)).where(WANTED.c.study_id == number)) or 0
+        blocks = blocks_of({one.key: one for one in to_run}.values(), study.block, plan.runtime.workers or 1)
+        block_of = {one.key: index for index, block in enumerate(blocks, last + 1) for one in block.episodes}
+        for one, row in to_run.items():
+            row["block"] = block_of[one.key]
+        _replace(connection, before, after)
 
 
 _KEY = ("setting_id", "task", "seed")
-_VALUES = ("position", "episode_id", "error", "block", "worker", "attempts", "anew")
-_OF_KEY = [WANTED.c[name] == sa.bindparam(f"of_{name}") for name in _KEY]
+_NOBODYS = {"block": None, "worker": None, "attempts": 0}
 
 
-def _update(*names: str) -> sa.Update:
-    return sa.update(WANTED).where(*_OF_KEY).values({name: sa.bindparam(f"of_{name}") for name in names})
+def _key(row: Any) -> tuple[int, str, int]:
+    return row.setting_id, row.task, row.seed
 
 
-def _stays(row: Any, linked: int | None, plan: Plan, is_shared: bool) -> bool:
+def _values(row: Any) -> dict[str, Any]:
+    return {column.name: getattr(row, column.name) for column in WANTED.c}
+
+
+def _replace(connection: sa.Connection, before: Mapping[Any, Any], after: Mapping[Any, Any]) -> None:
+    """Write the rows of a study in which `after` differs from `before`."""
+    same_row = [WANTED.c[name] == sa.bindparam(f"of_{name}") for name in _KEY]
+    gone = [dict(zip(map("of_{}".format, _KEY), key, strict=True)) for key in before if before[key] != after.get(key)]
+    new = [row for key, row in after.items() if row != before.get(key)]
+    if gone:
+        connection.execute(sa.delete(WANTED).where(*same_row), gone)
+    if new:
+        connection.execute(sa.insert(WANTED), new)
+
+
+def _is_unfinished(row: Mapping[str, Any]) -> bool:
+    return row["block"] is not None and row["episode_id"] is None and row["error"] is None
+
+
+def _stays(row: Mapping[str, Any], linked: int | None, plan: Plan, is_shared: bool) -> bool:
     """Return whether a row of the study stays as it is: it has an episode that counts, or a worker may run it."""
-    if row.episode_id is not None:
-        return linked is not None or row.episode_id not in plan.seen
-    return is_shared and row.is_unfinished
+    if row["episode_id"] is not None:
+        return linked is not None or row["episode_id"] not in plan.seen
+    return is_shared and _is_unfinished(row)
 
 
-def _positions(wanted: Iterable[tuple[int, str, int]], before: Mapping[tuple[int, str, int], Any]) -> dict[Any, int]:
-    """Return the position of each row in the study. The old ones are kept if that is the order of the plan."""
-    wanted = list(wanted)
-    old = [before[key].position if key in before else None for key in wanted]
-    there = [position for position in old if position is not None]
-    last = max((row.position for row in before.values()), default=0)
-    if there == sorted(there) and None not in old[: len(there)]:
-        return dict(zip(wanted, [*there, *range(last + 1, last + 1 + len(old) - len(there))], strict=True))
-    return {key: last + number for number, key in enumerate(wanted, 1)}
+def _still_asked_for(rows: Mapping[Any, dict[str, Any]], wanted: Iterable[tuple[int, str, int]]) -> dict[Any, Any]:
+    """Return the rows of other tasks that stay beside a plan. Nobody runs them."""
+    tasks, seeds = set[str](), defaultdict[int, list[int]](list)
+    for number, task, seed in wanted:
+        tasks.add(task)
+        seeds[number].append(seed)
+    spans = {number: range(min(some), max(some) + 1) for number, some in seeds.items()}
+    kept = {}
+    for key, row in rows.items():
+        number, task, seed = key
+        if task not in tasks and seed in spans.get(number, ()):
+            kept[key] = row | _NOBODYS if _is_unfinished(row) else row
+    return kept
 
 
-def _somebody_runs(connection: sa.Connection, study: Study, run: str) -> bool:
-    if any(row.id != run for row in running(study.database, connection, study.kind, study.name)):
-        return True
-    mine = WANTED.join(STUDIES, WANTED.c.study_id == STUDIES.c.id)
-    claimed = sa.select(WANTED.c.worker).distinct().select_from(mine).where(STUDIES.c.name == study.name, UNFINISHED)
-    return bool(living(study.database, connection).keys() & set(connection.scalars(claimed)))
-
-
-def _check_orders(study: Study, to_run: Mapping[Episode, object], is_shared: bool) -> None:
-    for part in ordered_parts(study.episodes, study.block) if is_shared else ():
+def _check_orders(study: Study, to_run: Mapping[Episode, object]) -> None:
+    for part in ordered_parts(study.episodes, study.block):
         if 0 < sum(one in to_run for one in part) < len(part):
             raise UsageError(
                 f"study {study.name} is running, and {part[0].setting.label} adapts from episode to episode: "
@@ -281,24 +280,52 @@ def _check_orders(study: Study, to_run: Mapping[Episode, object], is_shared: boo
             )
 
 
-def _take_away(connection: sa.Connection, study: Study, ids: Mapping[str, int], rows: Iterable[Any]) -> None:
-    """Remove rows outside a plan, or let them lose their block. `save` says which."""
-    seeds = defaultdict[int, list[int]](list)
-    for one in study.episodes:
-        seeds[ids[one.setting.label]].append(one.seed)
-    spans = {number: (min(some), max(some)) for number, some in seeds.items()}
-    tasks, gone, idle = set(study.tasks), [], []
-    for row in rows:
-        low, high = spans.get(row.setting_id, (0, -1))
-        key = {f"of_{name}": getattr(row, name) for name in _KEY}
-        if row.task in tasks or not low <= row.seed <= high:
-            gone.append(key)
-        elif row.is_unfinished:
-            idle.append(key)
-    if gone:
-        connection.execute(sa.delete(WANTED).where(*_OF_KEY), gone)
-    if idle:
-        connection.execute(sa.update(WANTED).where(*_OF_KEY).values(block=None, worker=None, attempts=0), idle)
+def _save_settings(connection: sa.Connection, study: Study, is_shared: bool) -> tuple[int, dict[str, int]]:
+    """Write a study's row and its settings. Return the number of the row, and the numbers of the settings by label.
+
+    Unless somebody runs the study, settings that it has no longer are deleted with their rows, and so is a setting that
+    has another hash now. All are, if the baseline is among these.
+    """
+    about = {name: getattr(study, name) for name in ABOUT}
+    number = _put(connection, STUDIES, {"name": study.name}, {"kind": study.kind, "created": now(), "about": about})
+    stored = sa.select(SETTINGS.c.label, SETTINGS.c.work).where(SETTINGS.c.study_id == number)
+    works: dict[str, str] = dict(connection.execute(stored).all())
+    if not is_shared:
+        kept = [one.label for one in study.settings if works.get(one.label) == one.work]
+        kept = kept if study.baseline in kept else []
+        connection.execute(sa.delete(SETTINGS).where(SETTINGS.c.study_id == number, SETTINGS.c.label.not_in(kept)))
+    ids = {}
+    for position, setting in enumerate(study.settings):
+        if is_shared and works.get(setting.label, setting.work) != setting.work:
+            raise UsageError(
+                f"study {study.name} is running, with other settings of {setting.label}: wait until it has ended, or "
+                "write a study of another name"
+            )
+        values = {
+            "work": setting.work,
+            "position": position,
+            "name": setting.name,
+            "method": str(setting.settings["method"]),
+            "varies": dict(setting.varies),
+            "overrides": list(setting.overrides),
+            "settings": dict(setting.settings),
+            "identity": dict(setting.identity),
+        }
+        ids[setting.label] = _put(connection, SETTINGS, {"study_id": number, "label": setting.label}, values)
+    return number, ids
+
+
+def _put(connection: sa.Connection, table: sa.Table, key: Mapping[str, Any], values: Mapping[str, Any]) -> int:
+    """Change the row with this key, or insert one. Return its number."""
+    changed = sa.update(table).filter_by(**key).values(**values).returning(table.c.id)
+    new = sa.insert(table).values(**key, **values).returning(table.c.id)
+    return int(connection.scalar(changed) or connection.scalar(new))
+
+
+def _other_commands(study: Study, alive: Mapping[str, str], run: str) -> sa.ColumnElement[bool]:
+    """Return the condition that another living command makes the study."""
+    others = RUNS.c.id.in_(set(alive.values()) - {run})
+    return sa.exists().where(RUNS.c.kind == study.kind, RUNS.c.name == study.name, others)
 
 
 def withdraw(plan: Plan, run: str) -> None:
@@ -308,10 +335,9 @@ def withdraw(plan: Plan, run: str) -> None:
     """
     study = plan.study
     with study.database.writing() as connection:
-        if any(row.id != run for row in running(study.database, connection, study.kind, study.name)):
-            return
+        alive = living(study.database, connection)
         mine = sa.select(STUDIES.c.id).where(STUDIES.c.name == study.name).scalar_subquery()
-        alive = [name for name, whose in living(study.database, connection).items() if whose != run]
-        free = sa.or_(WANTED.c.worker.is_(None), WANTED.c.worker.not_in(alive))
+        others = [name for name, whose in alive.items() if whose != run]
+        free = sa.or_(WANTED.c.worker.is_(None), WANTED.c.worker.not_in(others))
         idle = sa.update(WANTED).where(WANTED.c.study_id == mine, UNFINISHED, free)
-        connection.execute(idle.values(block=None, worker=None, attempts=0))
+        connection.execute(idle.where(~_other_commands(study, alive, run)).values(**_NOBODYS))

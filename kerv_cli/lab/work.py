@@ -205,11 +205,10 @@ def work(
             if claim is not None:
                 _Attempt(queue, claim, prepare, on_event, load).run()
                 continue
-            left, free = patiently(queue.left)
+            left = patiently(queue.left)
             if not left:
                 return
-            if not free:
-                bury(queue.database)
+            bury(queue.database)
             if time.monotonic() - told > WAITING_SECONDS:
                 told = time.monotonic()
                 on_event(BlocksWait(left))

@@ -46,15 +46,12 @@ def work_command(database: Database, study: str, **settings: str) -> str:
     return shlex.join(["kerv", "work", *words])
 
 
-def gpus_in_turn(device: str) -> list[str]:
+def gpus_in_turn(plan: Plan) -> list[str]:
     """Return one value of CUDA_VISIBLE_DEVICES per GPU. Workers get these values in turn.
 
-    If the list is empty, the workers see the same GPUs as this process.
-
-    Args:
-        device: Device of the settings. If it is no GPU, or a GPU with a number as in `cuda:1`, the list is empty.
+    Empty if the workers see the same GPUs as this process: not all settings run on `cuda`, the GPU without a number.
     """
-    if device != "cuda":
+    if {one.setting.settings["runtime"]["device"] for one in plan.to_run} != {"cuda"}:
         return []
     visible = os.environ.get(GPUS)
     if visible is not None:
@@ -92,7 +89,7 @@ def workers(plan: Plan, run: str, say: Callable[[str], object] = lambda line: No
     threads = max((one.setting.settings["runtime"]["threads"] for one in plan.to_run), default=1)
     environment |= dict.fromkeys(THREAD_VARIABLES, str(threads))
     number = min(runtime.workers, len(plan.blocks))
-    with LocalWorkers(study.database, study.name, run, number, environment, gpus_in_turn(plan.device)) as local:
+    with LocalWorkers(study.database, study.name, run, number, environment, gpus_in_turn(plan)) as local:
         yield local.tend
 
 
