@@ -61,8 +61,8 @@ pages: setup ## fill the figures of README.md and results/README.md from results
 	@$(BIN)/python scripts/figures.py README.md results/README.md
 
 docs: setup ## build the pages as a site in build/site; a link that leads nowhere is an error
-	@$(BIN)/python -c 'import material' 2>/dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
-	@$(BIN)/mkdocs build --quiet
+	@$(BIN)/python -c 'import zensical' 2>/dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	@$(BIN)/python scripts/docs.py
 
 lock: setup ## write requirements/*.txt from what is installed, with the hashes of the files
 	@$(BIN)/python scripts/lock.py

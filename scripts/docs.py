@@ -1,44 +1,40 @@
-"""What `make docs` adds to the pages of docs/: the start page, the results with their plots, and the command reference.
+"""`make docs`: the pages of docs/, the start page, the results and the command reference as a site in build/site.
 
-mkdocs calls `on_files`. Links of README.md and results/ are of the repository; here they become those of the site.
+They are collected in build/pages, from where zensical reads them. Links of README.md and results/ are of the
+repository; here they become those of the site, and a link to a file that is no page becomes plain text.
 """
 
 from __future__ import annotations
 
 import posixpath
 import re
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = {"index.md": "README.md", "results.md": "results/README.md", "log.md": "results/LOG.md"}
+PAGES = {
+    "index.md": "README.md",
+    "results.md": "results/README.md",
+    "log.md": "results/LOG.md",
+}
 """Page of the site -> its source, for those that do not lie in docs/."""
 
 WIDTH = 110  # columns of a help text
-_LINK = re.compile(r"(\]\()([^)#\s]+)")
+_LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)#\s]+)([^)]*)\)")
 
 
-def on_files(files: Any, config: Any) -> Any:
-    """Adds the pages to those that mkdocs found."""
-    from mkdocs.structure.files import File
-
-    for page in PAGES:
-        files.append(File.generated(config, page, content=page_of(page)))
-    files.append(File.generated(config, "reference.md", content=reference()))
-    return files
-
-
-def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """The text of a page, with the links of a page in docs/ that leave it."""
-    source = page.file.src_uri
-    return markdown if source in (*PAGES, "reference.md") else relinked(markdown, f"docs/{source}")
-
-
-def page_of(page: str) -> str:
-    """A page whose source lies outside of docs/, as a page of the site."""
-    source = PAGES[page]
-    return relinked((ROOT / source).read_text(encoding="utf-8"), source)
+def collect(folder: Path) -> None:
+    """Write the source of every page into the folder."""
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(ROOT / "docs", folder)
+    sources = {path.name: f"docs/{path.name}" for path in folder.glob("*.md")} | PAGES
+    for page, source in sources.items():
+        text = (ROOT / source).read_text(encoding="utf-8")
+        (folder / page).write_text(relinked(text, source), encoding="utf-8")
+    (folder / "reference.md").write_text(reference(), encoding="utf-8")
 
 
 def relinked(text: str, source: str) -> str:
@@ -46,11 +42,12 @@ def relinked(text: str, source: str) -> str:
     pages = {path: page for page, path in PAGES.items()}
 
     def link(match: re.Match[str]) -> str:
-        target = match[2]
+        image, words, target, anchor = match.groups()
         if re.match(r"[a-z]+:", target):
             return match[0]
         path = posixpath.normpath(posixpath.join(posixpath.dirname(source), target))
-        return match[1] + pages.get(path, re.sub(r"^(docs|results)/", "", path))
+        page = pages.get(path, path.removeprefix("docs/"))
+        return f"{image}[{words}]({page}{anchor})" if path in pages or path.startswith("docs/") else words
 
     return _LINK.sub(link, text)
 
@@ -80,3 +77,8 @@ def help_of(path: tuple[str, ...]) -> str:
     if result.exit_code:
         raise RuntimeError(f"kerv {' '.join(path)} --help: {result.output}")
     return str(result.output).rstrip()
+
+
+if __name__ == "__main__":
+    collect(ROOT / "build/pages")
+    sys.exit(subprocess.call([Path(sys.executable).with_name("zensical"), "build", "-f", "mkdocs.yml"], cwd=ROOT))

@@ -106,7 +106,7 @@ def test_links_of_the_repository_become_links_of_the_site(docs):
     text = "[a](docs/methods.md#7-measures) ![b](docs/film.webp) [c](results/README.md) [d](https://rerun.io)"
     expected = "[a](methods.md#7-measures) ![b](film.webp) [c](results.md) [d](https://rerun.io)"
     assert docs.relinked(text, "README.md") == expected
-    assert docs.relinked("[a](LOG.md) ![b](plots/main.png)", "results/README.md") == "[a](log.md) ![b](plots/main.png)"
+    assert docs.relinked("[a](LOG.md), [b](tables/main.csv)", "results/README.md") == "[a](log.md), b"
     assert docs.relinked("[a](../results/README.md) [b](#here)", "docs/shipped.md") == "[a](results.md) [b](#here)"
 
 
