@@ -102,7 +102,6 @@ def test_a_datastore_and_a_calibration_are_not_replaced_by_their_own_command(res
         assert artifacts(results) == before
         told(*words, f"results={results}", "episodes=5", "replace=true")
         assert artifacts(results) != before
-    told("calibrate", *CALIBRATION, f"results={results}", "complete=true")
 
 
 @pytest.mark.parametrize("name", RELEASED)

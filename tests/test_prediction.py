@@ -140,7 +140,7 @@ def test_a_gripper_is_filtered_only_with_a_fitted_noise():
     assert Kalman(SPACE.is_strict, fitted).predict(actions, 1)[0, 3] == actions[-1, 3]
     free = Kalman(SPACE.is_strict, fitted).released().predict(actions, 1)[0]
     assert free[3] == pytest.approx(np.clip(kalman_weights(1.0, 1.0, 10, 1) @ actions[:, 3], -1, 1)[0])
-    with pytest.raises(CheckpointError, match="complete=true"):
+    with pytest.raises(CheckpointError, match="replace=true"):
         Kalman(SPACE.is_strict, unfitted).released()
 
 

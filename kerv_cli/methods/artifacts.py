@@ -169,14 +169,13 @@ class Artifacts:
         beside = Path(self.description.origin.get("base", self.folder))
         return kind_of(kind).path(self.results, self.policy.artifacts.get(kind), beside)
 
-    def new(self, kind: str, adds: bool = False) -> Path:
-        """Return the path to which a command writes. `adds`: it only adds, which a shipped policy's artifact allows."""
+    def new(self, kind: str) -> Path:
+        """Return the path to which a command writes. Artifacts of shipped policies are refused."""
         name = self.policy.artifacts.get(kind)
         if name:
             check_name(name, f"policy.artifacts.{kind}:")
         path = self.path(kind)
-        if not adds:
-            check_not_shipped(path, f"policy.artifacts.{kind}")
+        check_not_shipped(path, f"policy.artifacts.{kind}")
         return path
 
     def exists(self, kind: str) -> bool:

@@ -124,8 +124,8 @@ class Calibration:
         row = self.variability[task]
         if measure != MEAN and measure not in row.levels:
             raise CheckpointError(
-                f"the calibration has no reference level K_S for K as the {measure} tokens: run 'kerv calibrate "
-                "complete=true' for the policy, or name threshold.k_s"
+                f"the calibration has no reference level K_S for K as the {measure} tokens: name "
+                f"threshold.k_s, or {AGAIN}"
             )
         return row.levels.get(measure, row.k_s)
 

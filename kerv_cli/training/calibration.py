@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, astuple, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
@@ -68,7 +68,6 @@ class CalibrationWork:
     tasks: tuple[str, ...]
     missing: list[str]  # kinds of artifacts without which sections are left out
     path: Path
-    old: stored.Calibration | None  # the calibration to complete
 
     def __call__(self, stage: Stage) -> Calibrated:
         """Measure the sections, and write them to one JSON file."""
@@ -79,7 +78,7 @@ class CalibrationWork:
             )
         variability, skip = self.variability(stage), self.skip(stage)
         with stage("boundary ranges") as progress:
-            boundary = fit_boundary(paths, settings.boundary_windows, self.old, progress)
+            boundary = fit_boundary(paths, settings.boundary_windows, progress)
         with stage("fitting the predictors"):
             noise = fit_filters(past, future)
         calibration = stored.Calibration(
@@ -92,8 +91,6 @@ class CalibrationWork:
             skip=skip,
             provenance=provenance_of("kerv calibrate", settings, self.artifacts.device),
         )
-        if self.old is not None:
-            calibration = completed(self.old, calibration)
         write_json(self.path, stamped(asdict(calibration)))
         no_drafter = ", no drafter" if "drafter" in self.missing else ""
         notes = [] if variability else [f"no reference levels K_S: decodes={settings.decodes}{no_drafter}"]
@@ -131,17 +128,16 @@ def plan_calibration(settings: CalibrateSettings, database: Database) -> Plan[Ca
     drafting().check(target)
     missing = [kind for kind in ("drafter", "datastore") if not artifacts.exists(kind)]
     artifacts.check({"datastore"} - set(missing))
-    path = artifacts.new("calibration", adds=settings.complete)
-    check = partial(check_free, path, "policy.artifacts.calibration", settings.replace or settings.complete)
+    path = artifacts.new("calibration")
+    check = partial(check_free, path, "policy.artifacts.calibration", settings.replace)
     check()
-    old: stored.Calibration | None = artifacts.load("calibration") if settings.complete else None
     without = f"; without {' and '.join(missing)}" if missing else ""
     text = (
         f"{path}: predictors fitted on {count(len(chosen), 'demonstration')} of {count(len(tasks), 'task')}; "
         f"{settings.decodes} decodes per task; boundary over {', '.join(map(str, settings.boundary_windows))} "
         f"positions{without}"
     )
-    work = CalibrationWork(settings, artifacts, dataset, chosen, tasks, missing, path, old)
+    work = CalibrationWork(settings, artifacts, dataset, chosen, tasks, missing, path)
     return Plan("calibration", path, text, work, check)
 
 
@@ -206,34 +202,12 @@ def episode_decodes(decoder: Decoder, dataset: DemoDataset, index: int, decodes:
     return records
 
 
-def fit_boundary(
-    paths: list[np.ndarray], windows: Sequence[int], old: stored.Calibration | None, progress: OnProgress
-) -> stored.BoundarySection:
-    known = old.boundary.windows if old is not None and old.boundary is not None else {}
-    ranges = dict(known)
+def fit_boundary(paths: list[np.ndarray], windows: Sequence[int], progress: OnProgress) -> stored.BoundarySection:
+    ranges = {}
     for number, window in enumerate(windows, 1):
-        ranges[str(window)] = BoundaryRanges.fit(paths, window, known.get(str(window)))
+        ranges[str(window)] = BoundaryRanges.fit(paths, window)
         progress(number, len(windows))
     return stored.BoundarySection(len(paths), ranges)
-
-
-def completed(old: stored.Calibration, new: stored.Calibration) -> stored.Calibration:
-    """Return the old calibration, with the numbers of the new one that it lacks. `new` has both's boundary ranges."""
-    known, found = old.noise["kalman"], new.noise["kalman"]
-    columns = np.where(known.q, astuple(known), astuple(found))  # q and r
-    noise = {"kalman": Noise(*map(tuple, columns.tolist()))}
-    variability = dict(new.variability)
-    for task, row in old.variability.items():
-        measured = new.variability[task].levels if task in new.variability else {}
-        variability[task] = replace(row, levels={**measured, MEAN: row.k_s, **row.levels})
-    return replace(
-        old,
-        noise=noise,
-        variability=variability,
-        boundary=new.boundary,
-        skip=old.skip or new.skip,
-        provenance={**old.provenance, "completed": new.provenance},
-    )
 
 
 def episode_windows(episode: DemoEpisode, actions: ActionSpace, window: int, horizon: int) -> np.ndarray:

@@ -52,7 +52,7 @@ def plan(settings: PrepareSettings, database: Database) -> list[Step]:
             command = (*command, f"train.steps={settings.steps}")
         state = _state(artifacts, database, kind, kinds, settings.replace)
         if state == INCOMPLETE:
-            command = (*command, "complete=true")
+            command = (*command, "replace=true")
         steps.append(Step(kind, state, command))
     if any(step.state != THERE for step in steps):
         demos_for(settings, description, database)

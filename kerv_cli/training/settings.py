@@ -202,7 +202,6 @@ class CalibrateSettings(DemonstrationSettings):
         [5, 15, 30], "window lengths w of the boundary, in positions", **limits(3, 10_000)
     )
     decodes: int = number(60, 0, 100_000, help="decodes per task from which K_S is measured; 0: no K_S")
-    complete: bool = setting(False, "keep every number of the existing calibration; add those that it lacks")
 
     def check_together(self, prefix: str) -> None:
         if not self.boundary_windows:

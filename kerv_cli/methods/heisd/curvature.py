@@ -64,13 +64,8 @@ class BoundaryRanges:
             raise CheckpointError(f"{self} is no range: build it from demonstrations in which the hand moves")
 
     @classmethod
-    def fit(cls, paths: Iterable[np.ndarray], window: int, known: BoundaryRanges | None = None) -> BoundaryRanges:
-        """Measure the ranges over all windows of some episodes.
-
-        Args:
-            paths: Measured hand positions of each episode, (T, 3) metres.
-            known: An older calibration's ranges. They are kept, and only the attribute `points` is measured.
-        """
+    def fit(cls, paths: Iterable[np.ndarray], window: int) -> BoundaryRanges:
+        """Measure the ranges over all windows of some episodes' hand positions, (T, 3) metres each."""
         measured = []
         for path in paths:
             for end in range(LEAST, len(path) + 1):
@@ -81,7 +76,7 @@ class BoundaryRanges:
         if not len(radii):
             raise CheckpointError("the demonstrations hold no curved path: the boundary's ranges cannot be taken")
         high = (float(np.percentile(x, 95)) for x in (radii, lengths))
-        ranges = known or cls(float(radii.min()), next(high), float(lengths.min()), next(high))
+        ranges = cls(float(radii.min()), next(high), float(lengths.min()), next(high))
         scaled = sorted((ranges.normalise(*one) for one in measured), key=sum)
         kept = (np.arange(POINTS) + 0.5) / POINTS * len(scaled)
         # rounded down, so that windows whose F is the limit itself reach it
@@ -92,8 +87,8 @@ class BoundaryRanges:
         """Return the limit F*: a quantile of F over the windows of the demonstrations."""
         if not self.points:
             raise CheckpointError(
-                "the calibration has no quantiles of F for boundary.quantile: run 'kerv calibrate complete=true' for "
-                "the policy, or name the limit with boundary.f_star"
+                "the calibration has no quantiles of F for boundary.quantile: name the limit with boundary.f_star, or "
+                "run 'kerv calibrate replace=true' for the policy"
             )
         radii, lengths = np.array(self.points).T
         return float(np.quantile(alpha * radii + (1 - alpha) * lengths, quantile))
