@@ -21,7 +21,7 @@ NEW = Path(__file__).with_name("last_action.yaml")
 """Presets that version 1.0.0 did not have."""
 ENGINES = Path(__file__).with_name("engines.json")
 """ENGINE -> hash of the golden file that it was raised for."""
-TASKS = ("drawer-close-v3", "window-open-v3")
+TASKS = ("drawer-close-v3",)
 SEEDS = (100_000,)
 
 
