@@ -114,8 +114,12 @@ def _again(row: Row) -> str:
     return f"{value} ({low}–{high})"
 
 
+CLAIMED = {"spec_vla": "1.42", "kerv": "1.27 × Spec-VLA", "heisd": "2.45", "naive_sd": "0.87 (HeiSD)"}
+"""Setting -> what its paper says, over its own loop."""
+
 COLUMNS: dict[str, tuple[str, Callable[[Row], str]]] = {
     "setting": ("setting", lambda row: row["label"]),
+    "claimed": ("claimed", lambda row: CLAIMED.get(row["label"], "")),
     "success": ("success", lambda row: f"{row['successes']}/{row['episodes']}"),
     "percent": ("success, %", lambda row: _interval(row, "success", ".1f", 100)),
     "lost/won": ("lost / won, p", _own(_lost_won)),
