@@ -365,7 +365,6 @@ ANSWERS = [
     ("view nothing.rrd", "nothing.rrd does not exist or is no recording"),
     ("report study=main", "results/kerv.db: run `kerv sweep study=main`"),
     ("report on=h100", "on=h100: name the study with study=NAME"),
-    ("runs compare a", "name two runs, ID or ID:SETTING: 'kerv runs list' shows them"),
     ("runs rm", "name a run: 'kerv runs list' shows them"),
     # studies
     ("sweep study=typo.yaml", "typo.yaml:1: unknown key 'study.setings': did you mean study.settings"),

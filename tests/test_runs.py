@@ -15,12 +15,12 @@ from typing import Any
 import pandas as pd
 import pytest
 from command import kerv
-from studies_synthetic import swept, threshold_study
 
 from kerv_cli.catalogue.entries import find_runs
 from kerv_cli.lab.database import opened
-from kerv_cli.lab.read import frame_of
+from kerv_cli.lab.read import decodes_of, frame_of, loaded
 from kerv_cli.lab.runs import Run
+from kerv_cli.lab.store import Study
 from kerv_cli.lab.work import EpisodeRunner
 
 FAST = ["policy=state", "policy.target=nano-state", "task=reach-v3", "world.horizon=8", "record=0"]
@@ -119,24 +119,10 @@ def test_a_run_is_shown_and_a_wrong_name_refused(results):
     assert "kerv rollout" in kerv("runs", "show", "last", "results=/tmp/no-such-results", code=2).stderr
 
 
-def test_two_runs_of_a_study_are_compared_setting_by_setting(tmp_path):
-    for name in ("one", "two"):
-        swept(tmp_path, threshold_study(["reach-v3", "push-v3"], name=name))
-    pairs = json.loads(works("runs", "compare", "one", "two", f"results={tmp_path}", "--json"))
-    assert [pair["first"].partition(":")[2] for pair in pairs] == ["ar", "naive_sd", "spec_vla r=3", "spec_vla r=9"]
-    assert {pair["tokens"] for pair in pairs} == {"the same tokens in 8 of 8 episodes"}
-    assert not any(pair["settings"] for pair in pairs)
-
-
-def test_comparison_says_what_differs_in_settings(results):
-    grid = next(run["id"] for run in listed(results, "method=spec_vla"))
-    (found,) = json.loads(
-        works("runs", "compare", f"{grid}:spec_vla r=5", f"{grid}:spec_vla r=9", f"results={results}", "--json")
-    )
-    assert found["settings"] == [{"key": "threshold.r", "first": 5, "second": 9}]
-    assert found["tokens"] == ""
-    single = next(run["id"] for run in listed(results, "method=ar"))
-    kerv("runs", "compare", single, "target/nano-state", f"results={results}", code=2)
+def tokens_of(results: Path, name: str) -> list[list[int]]:
+    store = loaded(Study(opened(results), name))
+    tokens: list[list[int]] = decodes_of(store, frame_of(store)["episode"].tolist(), ["tokens"])["tokens"].to_pylist()
+    return tokens
 
 
 @pytest.mark.bits
@@ -145,8 +131,7 @@ def test_a_repeated_rollout_has_the_same_tokens_and_a_folder_of_its_own(copy):
     works("rollout", "method=ar", "episodes=2", *FAST, f"results={copy}")
     again = listed(copy)[0]["id"]
     assert again != single
-    shown = works("runs", "compare", single, again, f"results={copy}")
-    assert "the same tokens in 2 of 2 episodes" in shown
+    assert tokens_of(copy, again) == tokens_of(copy, single)
     assert "removed" in works("runs", "rm", again, single, "--yes", f"results={copy}")
     assert listed(copy, "method=ar") == []
 
@@ -264,13 +249,3 @@ def test_removal_refuses_links_and_parts_of_names(copy, tmp_path):
     for part, said in ((name, "is a link to"), (name[:8], "unknown run"), ("last", "unknown run")):
         refused = kerv("runs", "rm", "-y", part, f"results={copy}", code=2)
         assert said in refused.stderr
-
-
-def test_episodes_and_decodes_as_parquet(tmp_path):
-    store, _ = swept(tmp_path, threshold_study(["reach-v3", "push-v3"]))
-    works("runs", "export", "threshold", "--to", "parquet", "--dir", f"{tmp_path}/out", f"results={tmp_path}")
-    folder = tmp_path / "out/threshold"
-    episodes, decodes = (pd.read_parquet(folder / f"{name}.parquet") for name in ("episodes", "decodes"))
-    assert len(episodes) == len(frame_of(store)) == 32
-    counted = decodes.groupby(["label", "task", "seed"]).size()
-    assert counted.to_dict() == episodes.set_index(["label", "task", "seed"])["decodes"].to_dict()

@@ -1,9 +1,8 @@
-"""`kerv runs`: list, show, compare, remove and export runs: sweeps, rollouts and trainings."""
+"""`kerv runs`: list, show, remove and export runs: sweeps, rollouts and trainings."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
-from itertools import starmap
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -27,15 +26,14 @@ if TYPE_CHECKING:
 
 
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask; names must be whole.")]
-To = Annotated[str, typer.Option("--to", help="csv or parquet.")]
-Folder = Annotated[Path | None, typer.Option("--dir", help="Folder to write to; default results/exports/FORMAT.")]
+Folder = Annotated[Path | None, typer.Option("--dir", help="Folder to write to; default results/exports.")]
 
 
-def _run_names(names: list[str], least: int = 1, most: int = 1, what: str = "a run") -> list[str]:
+def _run_names(names: list[str], most: int = 1) -> list[str]:
     from kerv_cli.episodes.resolve import study_name
 
-    if not least <= len(names) <= most:
-        raise UsageError(f"name {what}: 'kerv runs list' shows them")
+    if not 1 <= len(names) <= most:
+        raise UsageError("name a run: 'kerv runs list' shows them")
     return list(map(study_name, names))
 
 
@@ -123,32 +121,6 @@ def _total_row(row: Any) -> dict[str, object]:
     }
 
 
-@command("runs compare", writes=False)
-def compare_(settings: CommandSettings, names: list[str], as_json: AsJson = False) -> None:
-    """Compare two runs, ID or ID:SETTING: what differs in their settings, and how many tokens are the same.
-
-    NAME: runs (id, a unique part of it, or last) and results=DIR.
-
-    Examples:
-        kerv runs compare main:ar main:kerv
-        kerv runs compare main last
-    """
-    from kerv_cli.report.compare import compare, pairs_to_compare
-
-    runs = _run_names(names, 2, 2, "two runs, ID or ID:SETTING")
-    comparisons = list(starmap(compare, pairs_to_compare(database_of(settings), *runs)))
-    if as_json:
-        end_with_json(comparisons)
-    for comparison in comparisons:
-        typer.echo(f"\n{comparison['first']}  →  {comparison['second']}")
-        if comparison["settings"]:
-            print_rows(comparison["settings"])
-        else:
-            typer.echo("no difference in settings, weights, machine or versions")
-        if comparison["tokens"]:
-            typer.echo(comparison["tokens"])
-
-
 @command("runs rm")
 def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
     """Remove runs and everything in their folders, after asking for confirmation.
@@ -163,7 +135,7 @@ def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
 
     database = database_of(settings)
     runs, total = [], 0
-    for name in _run_names(names, 1, 1000):
+    for name in _run_names(names, 1000):
         runs.append(find_run(database, name, exact=yes))
         check_removable(runs[-1])
         total += disk_bytes(runs[-1].folder)
@@ -181,25 +153,28 @@ def rm(settings: CommandSettings, names: list[str], yes: Yes = False) -> None:
 
 
 @command("runs export", writes=False)
-def export(
-    settings: CommandSettings, names: list[str], to: To = "csv", folder: Folder = None, as_json: AsJson = False
-) -> None:
-    """Write the episodes of a run as CSV or Parquet.
+def export(settings: CommandSettings, names: list[str], folder: Folder = None, as_json: AsJson = False) -> None:
+    """Write the episodes of a run as CSV.
 
     NAME: runs (id, a unique part of it, or last) and results=DIR.
 
     Examples:
         kerv runs export last
-        kerv runs export main --to parquet
     """
-    from kerv_cli.catalogue.entries import find_run
-    from kerv_cli.report.export import export as hand_over
+    from kerv_cli.base.files import write_text
+    from kerv_cli.catalogue.entries import find_run, store_of
+    from kerv_cli.lab.read import frame_of, how_to_run
 
     (name,) = _run_names(names)
     database = database_of(settings)
-    folder = folder or database.results / "exports" / to
-    written = hand_over(find_run(database, name), database, to, folder)
+    run = find_run(database, name)
+    store = store_of(run, database)
+    episodes = frame_of(store)
+    if episodes.empty:
+        raise UsageError(f"study '{store.name}' has no episode yet: {how_to_run(store)}")
+    path = (folder or database.results / "exports") / f"{run.id}.csv"
+    episodes = episodes.drop(columns=["episode", "decode_seconds", "initial_state"])
+    write_text(path, episodes.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
     if as_json:
-        end_with_json({"folder": folder, "written": written})
-    for path in written:
-        typer.echo(path)
+        end_with_json({"folder": path.parent, "written": [path]})
+    typer.echo(path)
