@@ -1,6 +1,6 @@
 """How often the 95 % intervals of the tables contain the truth, by simulation: `python scripts/coverage.py [STUDIES]`.
 
-A simulated study has ten tasks, or one, in three groups of difficulty, and blocks of five seeds. Tasks differ in time,
+A simulated study has ten tasks, or one, and blocks of five seeds. Tasks differ in time,
 speedup and success. The speedup of a block is off by 8 % (the machine's state), that of a pair by 5 %; episodes
 that fail run to the horizon.
 Prints coverage in per cent, a row per interval and a column per number of blocks per task. Then the same of three runs,
@@ -10,7 +10,7 @@ each with seeds of its own: a run's speedup is off by 8 %, in all tasks together
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from kerv_cli.report.statistics import Estimate
 BLOCKS = (1, 2, 4, 10, 50)
 SEEDS_OF_RUNS = (1, 2, 5)
 SEEDS, DRIFT, NOISE, HORIZON = 5, 0.08, 0.05, 500
-GROUPS = ("easy", "hard", "medium")
 Drawn = tuple[Estimate, float]
 """An interval and the truth."""
 
@@ -35,9 +34,6 @@ class Tasks:
         self.steps = random.lognormal(4.4, 0.4, count)
         self.lost, self.won = random.uniform(0.01, 0.06, count), random.uniform(0.01, 0.04, count)
         self.neither = random.uniform(0.0, 0.1, count)
-        self.group = np.arange(count) % min(count, len(GROUPS))
-        # a macro average is one of groups, each of equal tasks
-        self.macro = 1 / (np.bincount(self.group)[self.group] * len(np.unique(self.group)))
 
 
 class Study:
@@ -54,7 +50,6 @@ class Study:
         self.task = np.repeat(np.arange(tasks.count), per_task)
         self.block = np.repeat(np.arange(tasks.count * blocks), seeds)
         self.seed = np.tile(np.arange(per_task), tasks.count)
-        self.group = tasks.group[self.task]
         u, t = random.random(n), tasks
         lost, won, neither = t.lost[self.task], t.won[self.task], t.neither[self.task]
         self.method = (u >= lost) & (u < 1 - neither)
@@ -75,56 +70,41 @@ class Study:
         """Numbers as names."""
         return [str(number) for number in of]
 
-    def averaged(self, estimate: Callable[[np.ndarray], Estimate]) -> Estimate:
-        """The mean over groups of what a mask of pairs gives."""
-        return stats.mean_of([estimate(self.group == number) for number in np.unique(self.group)])
 
-
-def success(study: Study, where: np.ndarray) -> Estimate:
+def success(study: Study) -> Estimate:
     """Success of the method with Wilson's interval."""
-    return stats.wilson(int(study.method[where].sum()), int(where.sum()))
+    return stats.wilson(int(study.method.sum()), study.method.size)
 
 
-def difference(study: Study, where: np.ndarray) -> Estimate:
+def difference(study: Study) -> Estimate:
     """Paired difference with Newcombe's interval."""
-    return stats.paired_difference(
-        stats.PairedCounts(*np.bincount(3 - 2 * study.baseline[where] - study.method[where], minlength=4).tolist())
-    )
+    outcomes = np.bincount(3 - 2 * study.baseline - study.method, minlength=4).tolist()
+    return stats.paired_difference(stats.PairedCounts(*outcomes))
 
 
-def speedup(study: Study, per_episode: bool, macro: bool) -> Drawn:
+def speedup(study: Study, per_episode: bool) -> Drawn:
     """Ratio of mean times, and its truth."""
-    t, everywhere = study.tasks, np.ones(study.task.size, bool)
+    t = study.tasks
     times = [study.step_baseline, study.step_method]
     means = [t.seconds * t.speedup, t.seconds]
     if per_episode:
         times = [times[0] * study.steps_baseline, times[1] * study.steps_method]
         fails = (t.won + t.neither, t.lost + t.neither)
         means = [mean * (t.steps * (1 - f) + HORIZON * f) for mean, f in zip(means, fails, strict=True)]
-    weights = t.macro if macro else np.full(t.count, 1 / t.count)
-    groups = study.names(study.group[everywhere]) if macro else None
-    found = stats.speedup(times[0], times[1], study.names(study.task), groups, study.names(study.block))
-    return found, float((weights * means[0]).sum() / (weights * means[1]).sum())
+    return stats.speedup(*times, study.names(study.task), study.names(study.block)), float(
+        means[0].sum() / means[1].sum()
+    )
 
 
 def intervals(study: Study) -> dict[str, Drawn]:
     """Every interval of a table."""
-    t, everywhere = study.tasks, np.ones(study.task.size, bool)
-    rate, gap = 1 - t.lost - t.neither, t.won - t.lost
-    drawn = {
-        "success, Wilson": (success(study, everywhere), study.micro(rate)),
-        "difference, Newcombe": (difference(study, everywhere), study.micro(gap)),
-        "speedup per step": speedup(study, False, False),
-        "speedup per episode": speedup(study, True, False),
+    t = study.tasks
+    return {
+        "success, Wilson": (success(study), study.micro(1 - t.lost - t.neither)),
+        "difference, Newcombe": (difference(study), study.micro(t.won - t.lost)),
+        "speedup per step": speedup(study, False),
+        "speedup per episode": speedup(study, True),
     }
-    if t.count > 1:
-        drawn |= {
-            "success, macro": (study.averaged(lambda where: success(study, where)), float((t.macro * rate).sum())),
-            "difference, macro": (study.averaged(lambda where: difference(study, where)), float((t.macro * gap).sum())),
-            "speedup per step, macro": speedup(study, False, True),
-            "speedup per episode, macro": speedup(study, True, True),
-        }
-    return drawn
 
 
 def coverage(tasks: int, blocks: int, studies: int, seed: int = 0) -> dict[str, float]:
@@ -143,7 +123,7 @@ def coverage_of_runs(runs: int, blocks: int, studies: int, per_episode: bool) ->
     random, truth, inside = np.random.default_rng([runs, blocks]), Tasks(10), 0
     for _ in range(studies):
         drifts = random.lognormal(-(DRIFT**2) / 2, DRIFT, runs)
-        drawn = [speedup(Study(truth, blocks, random, drift, seeds=1), per_episode, False) for drift in drifts]
+        drawn = [speedup(Study(truth, blocks, random, drift, seeds=1), per_episode) for drift in drifts]
         found = stats.over_runs([estimate for estimate, _ in drawn], same_pairs=False)
         inside += found.low <= drawn[0][1] <= found.high
     return inside / studies

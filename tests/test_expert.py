@@ -19,7 +19,7 @@ from kerv_cli.episodes.episode import run_episode
 from kerv_cli.episodes.policy import ExpertDecoder, check
 from kerv_cli.episodes.rows import decodes_table, episode_row, read_decodes, table_blob
 from kerv_cli.episodes.settings import RolloutSettings
-from kerv_cli.report.measures import MACRO, MICRO, measure, paired
+from kerv_cli.report.measures import measure, paired
 from kerv_cli.report.viewing import save_recording
 from kerv_cli.report.viewing.token_outcomes import summary
 from kerv_cli.worlds import EnvironmentPart
@@ -64,17 +64,16 @@ def test_rows_keep_it_and_measures_are_undefined_instead_of_divided_by_zero(epis
     assert third["actions"] == episode.decodes[3].actions.tolist()
     assert (third["mode"], third["tokens"], third["rounds"]) == ("expert", [], [])
     frame = pd.DataFrame([row | {"task": NAME, "seed": EVALUATION_SEED, "block": "b"}])
-    frame = frame.assign(difficulty=SPEC.task(NAME).difficulty, initial_state=str(row["initial_state"]), **STAMPS)
+    frame = frame.assign(initial_state=str(row["initial_state"]), **STAMPS)
     frame["decode_seconds"] = [np.array([decode.seconds for decode in episode.decodes])]
     slow = frame.assign(label="slow", seconds=frame["seconds"] * 10, success=False)
     episodes = pd.concat([frame.assign(label="own"), slow], ignore_index=True)
-    for averaging in (MICRO, MACRO):
-        found = measure(episodes, paired(episodes, {"own": "slow"}), averaging=averaging)["own"]
-        assert found.success.value == 1.0
-        assert (found.counts.only_method, found.counts.both) == (1, 0)
-        assert found.time_per_step_ms > 0
-        assert found.forwards_per_step == found.skip_rate == 0.0
-        assert all(map(math.isnan, (found.AL, found.accepted_per_round, found.AFEP, found.deviation)))
+    found = measure(episodes, paired(episodes, {"own": "slow"}))["own"]
+    assert found.success.value == 1.0
+    assert (found.counts.only_method, found.counts.both) == (1, 0)
+    assert found.time_per_step_ms > 0
+    assert found.forwards_per_step == found.skip_rate == 0.0
+    assert all(map(math.isnan, (found.AL, found.accepted_per_round, found.AFEP, found.deviation)))
 
 
 @pytest.mark.parametrize("frames", [False, True])

@@ -112,7 +112,7 @@ def test_links_of_the_repository_become_links_of_the_site(docs):
 
 def test_the_reference_has_the_help_of_every_command(docs):
     page = docs.reference()
-    for words in (("rollout",), ("train", "target"), ("runs", "compare")):
+    for words in (("rollout",), ("train", "target"), ("runs", "export")):
         assert f"## `kerv {' '.join(words)}`" in page
         shown = CliRunner().invoke(app, [*words, "--help"], prog_name="kerv", env={"COLUMNS": str(docs.WIDTH)})
         assert shown.output.rstrip() in page

@@ -14,7 +14,6 @@ from statsmodels.stats.proportion import proportion_confint
 from kerv_cli.report.statistics import (
     PairedCounts,
     mcnemar,
-    mean_of,
     paired_difference,
     pairs_to_settle,
     speedup,
@@ -24,28 +23,12 @@ from kerv_cli.report.statistics import (
 SCRIPT = Path(__file__).parents[1] / "scripts/coverage.py"
 
 
-def test_the_mean_of_groups_combines_their_intervals():
-    one, other = wilson(9, 10), wilson(6, 20)
-    low = 0.6 - 0.5 * math.hypot(0.9 - one.low, 0.3 - other.low)
-    high = 0.6 + 0.5 * math.hypot(one.high - 0.9, other.high - 0.3)
-    assert mean_of([one, other]) == pytest.approx((0.6, low, high), abs=1e-12)
-    assert mean_of([one]) == pytest.approx(one, abs=1e-12)
-
-
 def test_without_data_nothing_is_estimated():
     assert all(math.isnan(number) for number in (*wilson(0, 0), *paired_difference(PairedCounts(0, 0, 0, 0))))
     assert math.isnan(pairs_to_settle(PairedCounts(0, 0, 0, 0), 0.03))
     assert math.isnan(speedup(np.array([]), np.array([]), []).value)
     single = speedup(np.array([2.0]), np.array([1.0]), ["a"])
     assert (single.value, math.isnan(single.low), math.isnan(single.high)) == (2.0, True, True)
-
-
-def test_macro_speedup_weighs_groups_equally():
-    baseline, method = np.array([2.0, 4.0, 6.0, 30.0, 34.0]), np.array([1.0, 2.0, 3.0, 20.0, 20.0])
-    groups = ["easy", "easy", "easy", "hard", "hard"]
-    found = speedup(baseline, method, ["a", "a", "a", "b", "b"], groups)
-    assert found.value == pytest.approx((4.0 + 32.0) / (2.0 + 20.0))
-    assert speedup(baseline, method, ["a", "a", "a", "b", "b"]).value == pytest.approx(76.0 / 46.0)
 
 
 def test_the_interval_of_a_speedup_by_hand():

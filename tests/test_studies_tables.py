@@ -28,10 +28,10 @@ from kerv_cli.lab.plan import Episode
 from kerv_cli.lab.store import Study
 from kerv_cli.lab.study import save
 from kerv_cli.lab.work import RunEpisode
-from kerv_cli.report.measures import MACRO, MICRO, Result, columns_of
+from kerv_cli.report.measures import Result
 from kerv_cli.report.plots import acceptance_figure, colours_of, curves_figure, lines_of, png, study_figures
 from kerv_cli.report.report import CSV_COLUMNS, Report, further_of, render, report
-from kerv_cli.report.statistics import PairedCounts, mean_of, paired_difference, speedup
+from kerv_cli.report.statistics import PairedCounts, paired_difference, speedup
 from kerv_cli.report.summary import SummaryTable, not_in_turn, note_of, summary
 from kerv_cli.report.tables import StudyData, load_study
 from kerv_cli.report.tally import Tally
@@ -219,33 +219,21 @@ def test_the_baseline_has_no_verifications_and_a_speedup_of_one(data):
     assert row["skip_rate"] == row["unverified_share"] == 0.0
 
 
-def test_micro_pools_episodes_and_macro_averages_difficulty(data):
-    (result,) = (row for row in data.results if row.label == "kerv")
-    micro, macro = result.columns(), columns_of(vars(result.by_difficulty))
+def test_a_row_over_all_tasks_pools_episodes(data):
+    row = row_of(data.results, label="kerv")
     own, reference = [0.25, 0.05, 0.2, 0.2, 0.2], [0.5, 0.3, 1.0, 1.0, 1.0]
-    assert micro["success"] == pytest.approx(3 / 5)
-    assert macro["success"] == pytest.approx((1 + 1 / 3) / 2)
-    assert micro["time_per_step_ms"] == pytest.approx(1000 * sum(own) / 5)
-    assert macro["time_per_step_ms"] == pytest.approx(1000 * (0.15 + 0.2) / 2)
-    assert micro["speedup"] == pytest.approx(sum(reference) / sum(own))
-    assert macro["speedup"] == pytest.approx((0.4 + 1.0) / (0.15 + 0.2))
-    assert micro["AL"] == pytest.approx((6 + 4 * 3) / (3 + 4))
-    assert macro["AL"] == pytest.approx((2 + 3) / 2)
-    assert micro["forwards_per_step"] == pytest.approx((5 + 8) / (3 + 4))
-    assert macro["forwards_per_step"] == pytest.approx((5 / 3 + 2) / 2)
-    assert macro["deviation"] == pytest.approx(0.2)  # push was not sampled
-    for row in (micro, macro):
-        assert (row["both"], row["only_baseline"], row["only_method"], row["neither"]) == (3, 1, 0, 1)
-        assert row["mcnemar_p"] == 1.0
-        assert (row["margin"], row["non_inferior"]) == (0.03, False)
-        assert row["pairs_to_settle"] == math.inf  # the difference itself lies below the margin
-        assert row["pairs"] == 5
-    assert (micro["task"], micro["difficulty"]) == ("push-v3;reach-v3", "easy;hard")
-    assert (micro["tasks"], micro["episodes"]) == (2, 5)
-    pooled = paired_difference(PairedCounts(3, 1, 0, 1))
-    groups = mean_of([paired_difference(PairedCounts(*counts)) for counts in ((2, 0, 0, 0), (1, 1, 0, 1))])
-    for row, found in ((micro, pooled), (macro, groups)):
-        assert (row["difference"], row["difference_low"], row["difference_high"]) == pytest.approx(found)
+    assert row["success"] == pytest.approx(3 / 5)
+    assert row["time_per_step_ms"] == pytest.approx(1000 * sum(own) / 5)
+    assert row["speedup"] == pytest.approx(sum(reference) / sum(own))
+    assert row["AL"] == pytest.approx((6 + 4 * 3) / (3 + 4))
+    assert row["forwards_per_step"] == pytest.approx((5 + 8) / (3 + 4))
+    assert (row["both"], row["only_baseline"], row["only_method"], row["neither"]) == (3, 1, 0, 1)
+    assert row["mcnemar_p"] == 1.0
+    assert (row["margin"], row["non_inferior"]) == (0.03, False)
+    assert row["pairs_to_settle"] == math.inf  # the difference itself lies below the margin
+    assert (row["task"], row["tasks"], row["episodes"], row["pairs"]) == ("push-v3;reach-v3", 2, 5, 5)
+    found = paired_difference(PairedCounts(3, 1, 0, 1))
+    assert (row["difference"], row["difference_low"], row["difference_high"]) == pytest.approx(found)
 
 
 def harmed(data: StudyData, **harm: Any) -> StudyData:
@@ -352,7 +340,7 @@ def test_report_writes_the_same_bytes_again(results, written):
     ]
     labels = json.loads((results / "report/tables/threshold.json").read_text())["labels"]
     assert labels["spec_vla r=3"]["settings"]["threshold"]["r"] == 3
-    assert {MICRO, MACRO, "reach-v3"} <= set(labels["ar"]["measures"])
+    assert {"micro over tasks", "reach-v3"} <= set(labels["ar"]["measures"])
     table = pd.read_csv(results / "report/tables/threshold.csv")
     assert table["label"].is_unique
     assert table.groupby("label")["threshold.r"].first().to_dict() == {

@@ -9,7 +9,6 @@ import csv
 import io
 import itertools
 import math
-from collections import defaultdict
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from numbers import Real
@@ -25,11 +24,8 @@ from kerv_cli.report.statistics import NO_ESTIMATE, Estimate, PairedCounts
 
 Row = dict[str, Any]
 
-MICRO = "micro over tasks"
-MACRO = "macro over difficulty groups"
-ONE_TASK = "one task"
-# Way of averaging -> columns by which episodes are grouped
-_GROUPS = {MICRO: ["label"], MACRO: ["label"], ONE_TASK: ["task", "label"]}
+# Columns by which episodes are grouped
+OVERALL, PER_TASK = ["label"], ["task", "label"]
 # Key of a field's metadata: the measure is the first column's sum over episodes, divided by the second's
 RATIO = "ratio"
 
@@ -114,12 +110,10 @@ class Result:
     where: str  # the task of a row of one task. Empty for a row over all tasks.
     task: str
     tasks: int
-    difficulty: str
     seeds: str  # seeds of the episodes, as `seeds_text` writes them
     episodes: int
     baseline: str  # label of the setting that this setting is compared with
     measures: Measures
-    by_difficulty: Measures | None  # the unweighted mean over the difficulty groups. None for a row of one task.
     runs: int  # number of runs (commands) from which the intervals of speed were computed
     overrides: str
     settings: Mapping[str, Any]  # all settings as one dictionary with dotted keys, such as `threshold.r`
@@ -143,7 +137,7 @@ class Result:
         return 1.0 if self.is_baseline else self.measures.episode_speedup.value
 
     def columns(self) -> Row:
-        return columns_of({name: value for name, value in vars(self).items() if name not in ("where", "by_difficulty")})
+        return columns_of({name: value for name, value in vars(self).items() if name != "where"})
 
 
 def columns_of(values: Mapping[str, Any]) -> Row:
@@ -202,67 +196,52 @@ _PHASES = {f"ms.{phase}": f"seconds.{phase}" for phase in PHASES}
 def measure(
     episodes: pd.DataFrame,
     pairs: pd.DataFrame,
-    averaging: str = MICRO,
+    by: Sequence[str] = OVERALL,
     speeds: Mapping[Hashable, Speeds] | None = None,
 ) -> dict[Hashable, Measures]:
-    """Return every measure of each group of episodes: by label, or with ONE_TASK by task and label.
+    """Return every measure of each group of episodes.
 
     Args:
-        episodes: One row per episode. Columns: those of rows.EPISODE_SCHEMA, `label`, `decode_seconds`, `difficulty`,
-            `run`, `block`, and those of `COMPARABLE`.
+        episodes: One row per episode. Columns: those of rows.EPISODE_SCHEMA, `label`, `decode_seconds`, `run`, `block`,
+            and those of `COMPARABLE`.
         pairs: From `paired`.
-        averaging: MACRO returns the unweighted mean of the difficulty groups, MICRO and ONE_TASK pool the episodes.
-            Paired counts, McNemar's p and `pairs_to_settle` are always pooled.
+        by: OVERALL or PER_TASK.
         speeds: Speedups by group. If None, `speedups` computes them from `pairs`.
     """
-    speeds = speedups(pairs, averaging) if speeds is None else speeds
-    if averaging != MACRO:
-        episodes, pairs = episodes.assign(difficulty=""), pairs.assign(difficulty="")
-    by, outcomes, added = _GROUPS[averaging], list(PairedCounts._fields), list(ColumnPart.every())
-    parts = [*by, "difficulty"]
-    counted = episodes.assign(worlds=1, successes=episodes["success"].astype(bool))
-    counts = counted.groupby(parts)[["successes", "worlds", "steps", "decodes", "deviation_count"]].sum()
-    counts = counts.join(pairs.groupby(parts)[outcomes].sum()).fillna(0).astype(int)
-    means = _means(episodes, parts).groupby(level=by).mean().join(pairs.groupby(by)[["same_run", "same_block"]].mean())
+    speeds = speedups(pairs, by) if speeds is None else speeds
+    by, outcomes, added = list(by), list(PairedCounts._fields), list(ColumnPart.every())
+    counted = episodes.assign(episodes=1, successes=episodes["success"].astype(bool))
+    counts = counted.groupby(by)[["episodes", "successes", "steps", "decodes", "deviation_count"]].sum()
+    counts = counts.join(pairs.groupby(by)[outcomes].sum()).fillna(0).astype(int)
+    numbers: dict[Any, dict[str, int]] = counts.to_dict("index")
+    means = _means(episodes, by).join(pairs.groupby(by)[["same_run", "same_block"]].mean())
     phases: dict[Any, Any] = means[list(_PHASES)].to_dict("index")
     of_plugins: dict[Any, Any] = means[added].to_dict("index")
-    measured: dict[Hashable, Measures] = {}
     found: dict[Any, Any] = means.drop(columns=[*_PHASES, *added]).to_dict("index")
-    numbers: dict[Any, list[list[int]]] = defaultdict(list)
-    for (*group, _), row in zip(counts.index, counts.to_numpy().tolist(), strict=True):  # a row per difficulty group
-        numbers[tuple(group) if len(by) > 1 else group[0]].append(row)
+    measured: dict[Hashable, Measures] = {}
     for group, others in found.items():
-        rates, changes = [], []
-        for solved, worlds, _, _, _, *outcome in numbers[group]:
-            rates.append(stats.wilson(solved, worlds))
-            changes.append(stats.paired_difference(PairedCounts(*outcome)))
-        successes, _, steps, decodes, deviations, *outcome = map(sum, zip(*numbers[group], strict=True))
-        pooled = PairedCounts(*outcome)
+        number = numbers[group]
+        outcome = PairedCounts(*map(number.__getitem__, outcomes))
+        difference = stats.paired_difference(outcome)
         measured[group] = Measures(
-            successes=successes,
-            success=stats.mean_of(rates),
+            successes=number["successes"],
+            success=stats.wilson(number["successes"], number["episodes"]),
             phases=phases[group],
             added=of_plugins[group],
             same_run=others.pop("same_run") == 1,
             **others,
-            **compared(pooled, stats.mean_of(changes)),
-            pairs_to_settle=stats.pairs_to_settle(pooled, MARGIN),
-            steps=steps,
-            decodes=decodes,
-            deviation_samples=deviations,
+            counts=outcome,
+            mcnemar_p=stats.mcnemar(outcome) if sum(outcome) else math.nan,
+            difference=difference,
+            margin=MARGIN,
+            non_inferior=difference.low > -MARGIN,
+            pairs_to_settle=stats.pairs_to_settle(outcome, MARGIN),
+            steps=number["steps"],
+            decodes=number["decodes"],
+            deviation_samples=number["deviation_count"],
             **speeds.get(group, Speeds())._asdict(),
         )
     return measured
-
-
-def compared(counts: PairedCounts, difference: Estimate) -> dict[str, Any]:
-    return {
-        "counts": counts,
-        "mcnemar_p": stats.mcnemar(counts) if sum(counts) else math.nan,
-        "difference": difference,
-        "margin": MARGIN,
-        "non_inferior": bool(difference.low > -MARGIN),
-    }
 
 
 def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame:
@@ -274,8 +253,7 @@ def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame
     Returns:
         One row per pair, sorted by task and seed, with these columns:
 
-        - `label`, `task`, `difficulty`, `seed`, `decodes` (whether the setting runs a decoder), `same_run`,
-          `same_block`
+        - `label`, `task`, `seed`, `decodes` (whether the setting runs a decoder), `same_run`, `same_block`
         - `time` (seconds per control step), `seconds` (of the whole episode), `block` and `success`, each once with the
           ending _baseline and once with _method
         - the outcomes of `PairedCounts`: 1 for the outcome of this pair, 0 for the others
@@ -284,7 +262,6 @@ def paired(episodes: pd.DataFrame, baselines: Mapping[str, str]) -> pd.DataFrame
     columns = ["label", *keys, "run", "block", "success", "seconds", "initial_state", *COMPARABLE]
     other = episodes[columns].assign(time=episodes["seconds"] / episodes["steps"])
     method = other.assign(
-        difficulty=episodes["difficulty"],
         decodes=(episodes["forwards"] > 0) | (episodes["skipped_decodes"] > 0) | (episodes["server_decodes"] > 0),
         baseline=other["label"].map(baselines),
     )
@@ -315,34 +292,32 @@ class Speeds(NamedTuple):
     solved_speedup: Estimate = NO_ESTIMATE
 
 
-def speedups_of_runs(runs: Sequence[pd.DataFrame], averaging: str, same_pairs: bool) -> dict[Hashable, Speeds]:
+def speedups_of_runs(runs: Sequence[pd.DataFrame], by: Sequence[str], same_pairs: bool) -> dict[Hashable, Speeds]:
     """Return the speedups of each group of pairs, with intervals over the runs, or over episodes if there is one run.
 
     Args:
         runs: One table made by `paired` per run.
         same_pairs: Whether all runs measured the same pairs.
     """
-    combined, *others = [speedups(pairs, averaging) for pairs in runs]
+    combined, *others = [speedups(pairs, by) for pairs in runs]
     for group, speeds in combined.items() if others else ():
         several = zip(speeds, *[run.get(group, Speeds()) for run in others], strict=True)
         combined[group] = Speeds(*[stats.over_runs(estimates, same_pairs) for estimates in several])
     return combined
 
 
-def speedups(pairs: pd.DataFrame, averaging: str = MICRO, all_pairs: bool = False) -> dict[Hashable, Speeds]:
+def speedups(pairs: pd.DataFrame, by: Sequence[str] = OVERALL, all_pairs: bool = False) -> dict[Hashable, Speeds]:
     """Return the speedups of each group of pairs.
 
     A group is left out if no pair is usable, if an episode was not timed, or if its setting runs no decoder.
 
     Args:
-        averaging: With ONE_TASK, groups are by task and label, otherwise by label. With MACRO, a mean time is the mean
-            of the difficulty groups' means.
+        by: OVERALL or PER_TASK.
         all_pairs: Whether to use also pairs that were not measured in one block (side by side in one process).
     """
     timed = pairs if all_pairs else pairs[pairs["same_block"]]
     blocks = timed["block_method"].astype(str) + "|" + timed["block_baseline"].astype(str)
     tasks, clusters = pd.factorize(timed["task"])[0], pd.factorize(blocks)[0]
-    difficulties = pd.factorize(timed["difficulty"])[0] if averaging == MACRO else np.zeros(len(timed), int)
     decodes = timed["decodes"].to_numpy()
     solved = (timed["success_baseline"].astype(bool) & timed["success_method"].astype(bool)).to_numpy()
 
@@ -351,11 +326,11 @@ def speedups(pairs: pd.DataFrame, averaging: str = MICRO, all_pairs: bool = Fals
 
     def ratio(column: str, index: np.ndarray) -> Estimate:
         baseline, method = times[f"{column}_baseline"][index], times[f"{column}_method"][index]
-        return stats.speedup(baseline, method, tasks[index], difficulties[index], clusters[index])
+        return stats.speedup(baseline, method, tasks[index], clusters[index])
 
     untimed = np.isnan(times["seconds_baseline"]) | np.isnan(times["seconds_method"])
     found = {}
-    for group, members in timed.groupby(_GROUPS[averaging]).indices.items():
+    for group, members in timed.groupby(list(by)).indices.items():
         index = np.asarray(members)
         if decodes[index].any() and not untimed[index].any():
             solved_by_both = index[solved[index]]

@@ -158,6 +158,7 @@ def _tradeoff(results: Sequence[Result], loss: float, colours: Mapping[str, str]
         DIFFERENCE: (-loss, f"right of the dashed line: loses less than {loss:g} points"),
     }
     charts: list[alt.LayerChart] = []
+    datasets: dict[str, Sequence[Point]] = {}
     for column, (bound, hint) in panels.items():
         points = _points(results, column, dict.fromkeys(labels, ("", None)))
         for point in points:
@@ -169,7 +170,8 @@ def _tradeoff(results: Sequence[Result], loss: float, colours: Mapping[str, str]
         ends = [point[name] for point in points for name in ("value", "low", "high") if point[name] is not None]
         kind = "log" if column == SPEED and max(ends) > _SPREAD * min(ends) else "linear"
         names = alt.Axis(title=None, grid=True, ticks=False, labelPadding=8, domain=False, labels=not charts)
-        base = alt.Chart(alt.InlineData(points)).encode(
+        datasets[column] = points
+        base = alt.Chart(alt.NamedData(column)).encode(
             y=alt.Y("setting:N", scale=alt.Scale(domain=labels), axis=names),
             color=alt.Color("colour:N", scale=None),
             tooltip=_tooltip(points),
@@ -181,7 +183,7 @@ def _tradeoff(results: Sequence[Result], loss: float, colours: Mapping[str, str]
         dots = base.mark_point(filled=True, size=75, cursor="pointer").encode(x="value:Q", opacity=_faded(1.0))
         title = alt.Title(TITLES[column], subtitle=hint)
         charts.append((line + bars + dots).properties(title=title, width=_WIDTH, height=alt.Step(24)))
-    return _chart(charts, 2)
+    return _chart(charts, 2, datasets)
 
 
 def lines_figure(panels: Sequence[Panel], colours: Mapping[str, str], ylabel: str | None = None) -> alt.ConcatChart:
@@ -191,7 +193,7 @@ def lines_figure(panels: Sequence[Panel], colours: Mapping[str, str], ylabel: st
     legend, charts = alt.Legend(orient="bottom", columns=4, title=None, values=lines), []
     alone_scale = alt.Scale(zero=False, padding=12)
     for panel in panels:
-        base = alt.Chart(alt.InlineData(panel.points)).encode(
+        base = alt.Chart(alt.NamedData(panel.title)).encode(
             color=alt.Color("line:N", scale=scale, legend=legend), tooltip=_tooltip(panel.points)
         )
         y, low = (alt.Y(f"{name}:Q", scale=alone_scale, title=ylabel) for name in ("value", "low"))
@@ -207,7 +209,7 @@ def lines_figure(panels: Sequence[Panel], colours: Mapping[str, str], ylabel: st
             drawn.mark_point(filled=True, size=60, cursor="pointer").encode(y=y, color=own, opacity=_faded(1.0)),
         ]
         charts.append(alt.layer(*layers).properties(title=panel.title, width=_WIDTH, height=_HEIGHT))
-    return _chart(charts, _ACROSS)
+    return _chart(charts, _ACROSS, {panel.title: panel.points for panel in panels})
 
 
 def acceptance_figure(data: StudyData) -> alt.ConcatChart:
@@ -227,18 +229,10 @@ def acceptance_figure(data: StudyData) -> alt.ConcatChart:
         for points, (names, parts, wholes) in zip(places, lines, strict=True):
             for x, part, whole in zip(names, parts.tolist(), wholes.tolist(), strict=True):
                 if whole:
-                    share = 100.0 * part / whole
-                    point: Point = {
-                        "setting": label,
-                        "line": label,
-                        "x": x,
-                        "value": share,
-                        "low": share,
-                        "high": share,
-                    }
-                    points.append(
-                        point | {"text setting": label, "text place": x, "text tokens": part, "text of": whole}
-                    )
+                    point: Point = {"setting": label, "line": label, "x": x}
+                    point |= dict.fromkeys(("value", "low", "high"), 100.0 * part / whole)
+                    shown = {"text setting": label, "text place": x, "text tokens": part, "text of": whole}
+                    points.append(point | shown)
     titles = (
         "Accepted tokens, %, by position in the draft",
         "Accepted tokens, %, by DoF",
@@ -268,21 +262,23 @@ CURVES = {
 
 def curves_figure(log: pd.DataFrame) -> alt.ConcatChart:
     best = _best_step(log)
-    charts = []
+    charts: list[alt.LayerChart] = []
+    datasets: dict[str, Sequence[Point]] = {}
     for name in log.columns.drop("step"):
-        data = log[["step", name]].rename(columns={name: "value"})
+        datasets[str(name)] = log[["step", name]].dropna().set_axis(["step", "value"], axis=1).to_dict("records")
         title = CURVES.get(str(name), str(name).replace("_", " ").replace("l1 ", "error of "))
         shown = ["step:Q", alt.Tooltip("value:Q", title=title)]
-        base = alt.Chart(data).encode(x=alt.X("step:Q", title="training step"), tooltip=shown)
+        base = alt.Chart(alt.NamedData(str(name))).encode(x=alt.X("step:Q", title="training step"), tooltip=shown)
         y = alt.Y("value:Q", scale=alt.Scale(zero=False), title=None)
         line = base.mark_line(color=BLUE, point={"size": 30, "color": BLUE}).encode(y=y)
         mark = alt.Chart().mark_rule(strokeDash=[4, 3], color=MUTED).encode(x=alt.datum(best, type="quantitative"))
         charts.append((mark + line).properties(title=title, width=_WIDTH, height=_HEIGHT))
-    return _chart(charts, _ACROSS)
+    return _chart(charts, _ACROSS, datasets)
 
 
-def _chart(panels: list[alt.LayerChart], across: int) -> alt.ConcatChart:
-    chart = alt.concat(*panels, columns=across, spacing=28, config=_CONFIG)
+def _chart(panels: list[alt.LayerChart], across: int, datasets: Mapping[str, Sequence[Point]]) -> alt.ConcatChart:
+    # altair copies the data of a chart again and again, unless only its name is there
+    chart = alt.concat(*panels, columns=across, spacing=28, config=_CONFIG, datasets=datasets)
     chart.params = [alt.param("picked", value="").param]  # `add_params` would copy the panels again and again
     return chart
 

@@ -25,7 +25,7 @@ from kerv_cli.episodes.identity import NOT_DETERMINING, without
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.read import counts_of, studies, sweep_command
 from kerv_cli.lab.store import ROLLOUT, SWEEP, Study
-from kerv_cli.report.measures import MACRO, MICRO, Measures, Result, Row, columns_of, csv_text
+from kerv_cli.report.measures import Measures, Result, Row, columns_of, csv_text
 from kerv_cli.report.plots import about, acceptance_figure, library, study_figures
 from kerv_cli.report.profiles import NamedProfile, open_profiles
 from kerv_cli.report.reprice import Priced, own_profiles, prices_table, repriced
@@ -36,7 +36,7 @@ from kerv_cli.report.summary import (
     columns_shown,
     note_of,
     repriced_summary,
-    suite_table,
+    summary,
     task_table,
     with_code,
 )
@@ -180,19 +180,16 @@ def further_of(data: StudyData) -> dict[str, Any]:
             "measures": {},
         }
         measures = labels.setdefault(row.label, about)["measures"]
-        counts = {"tasks": row.tasks, "difficulty": row.difficulty}
-        measures[row.where or MICRO] = counts | _json_values(row.measures, CSV_COLUMNS)
-        if row.by_difficulty is not None:
-            measures[MACRO] = _json_values(row.by_difficulty)
+        measures[row.where or "micro over tasks"] = {"tasks": row.tasks} | _json_values(row.measures)
     for label, tally in data.tallies.items():
         labels[label]["acceptance"] = tally.as_dict()
     return {"study": data.name, "axis": data.study.axis, "labels": labels}
 
 
-def _json_values(measures: Measures, others: Sequence[str] = ()) -> Row:
+def _json_values(measures: Measures) -> Row:
     values = {}
     for name, value in columns_of(vars(measures)).items():
-        if name not in others:
+        if name not in CSV_COLUMNS:
             is_finite = not isinstance(value, float) or math.isfinite(value)
             values[name] = value if is_finite else None  # JSON has no NaN
     return values
@@ -210,7 +207,7 @@ def render(report: Report) -> str:
 def study_parts(report: Report) -> dict[str, Any]:
     data = report.data
     study, rows = data.study, data.results
-    suite = suite_table(rows)
+    suite = summary(rows)
     first, answer = rows[0].provenance, report.verdict.sentence
     if not answer.startswith(tuple(row.label for row in rows)):  # a label stays as it is
         answer = answer[:1].upper() + answer[1:]

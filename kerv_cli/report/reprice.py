@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.episodes.cost import COUNTED, READ_PHASES, Profile, Work, prices, read_profile, work_of
 from kerv_cli.lab.read import decodes_of
-from kerv_cli.report.measures import MICRO, Measures, Result, Row, columns_of, measure, paired, speedups
+from kerv_cli.report.measures import Measures, Result, Row, columns_of, measure, paired, speedups
 from kerv_cli.report.profiles import NamedProfile, open_profiles
 from kerv_cli.report.tables import StudyData
 
@@ -94,7 +94,7 @@ def _estimated(data: StudyData, works: Mapping[str, _LabelWork], profile: Profil
     episodes = data.episodes
     priced = pd.concat([_priced(episodes[episodes["label"] == label], work, profile) for label, work in works.items()])
     pairs = paired(priced, data.references)
-    return measure(priced, pairs, MICRO, speedups(pairs, all_pairs=True))
+    return measure(priced, pairs, speeds=speedups(pairs, all_pairs=True))
 
 
 def own_profiles(data: StudyData, elsewhere: bool = True) -> list[NamedProfile]:

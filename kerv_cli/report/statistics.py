@@ -56,23 +56,6 @@ def wilson(successes: float, episodes: float, confidence: float = 0.95) -> Estim
 _quantile = functools.cache(NormalDist().inv_cdf)
 
 
-def mean_of(groups: Sequence[Estimate]) -> Estimate:
-    """Estimate the unweighted mean of independent estimates. Unknown ones (NaN) are left out.
-
-    The distance from the mean to an end of its interval is √(sum of the groups' squared distances) / number of groups
-    (method of variance estimates recovery: Zou and Donner, Statistics in Medicine 27, 2008).
-    """
-    table = np.array(groups)
-    known = table[~np.isnan(table[:, 0])]
-    if not len(known):
-        return NO_ESTIMATE
-    values, lows, highs = known.T
-    mean = float(values.mean())
-    below = math.sqrt(((lows - values) ** 2).sum()) / len(known)
-    above = math.sqrt(((highs - values) ** 2).sum()) / len(known)
-    return Estimate(mean, mean - below, mean + above)
-
-
 def paired_difference(counts: PairedCounts) -> Estimate:
     """Estimate the method's success rate minus the baseline's, from −1 to 1. NaN if there are no pairs.
 
@@ -131,13 +114,7 @@ def mcnemar(counts: PairedCounts) -> float:
     return min(1.0, 2 * float(bdtr(min(lost, won), lost + won, 0.5)))
 
 
-def speedup(
-    baseline: np.ndarray,
-    method: np.ndarray,
-    strata: ArrayLike,
-    groups: ArrayLike | None = None,
-    blocks: ArrayLike | None = None,
-) -> Estimate:
+def speedup(baseline: np.ndarray, method: np.ndarray, strata: ArrayLike, blocks: ArrayLike | None = None) -> Estimate:
     """Estimate how many times as fast as the baseline a method is: mean time of the baseline / mean time of the method.
 
     The 95 % interval is computed for the ratio's logarithm, linearised, in a stratified cluster sample (Cochran,
@@ -149,24 +126,19 @@ def speedup(
         baseline: (pairs,) time of the baseline's episodes, in any unit.
         method: (pairs,) time of the method's episodes from the same initial states, in the same unit.
         strata: (pairs,) task of each pair.
-        groups: (pairs,) difficulty group of each pair. If given, mean times are unweighted means of the groups' means.
         blocks: (pairs,) block of each pair. If None, every pair counts as a block of its own.
     """
     a, b = np.asarray(baseline, dtype=np.float64), np.asarray(method, dtype=np.float64)
     if a.size == 0:
         return NO_ESTIMATE
-    weights = np.full(a.size, 1.0 / a.size)
-    if groups is not None:
-        _, members, sizes = np.unique(groups, return_inverse=True, return_counts=True)
-        weights = 1.0 / (sizes[members] * len(sizes))
-    mean_a, mean_b = float(weights @ a), float(weights @ b)
+    value = float(a.sum() / b.sum())
     strata = np.unique(strata, return_inverse=True)[1]
     clusters = np.unique(range(a.size) if blocks is None else blocks, return_inverse=True)[1]
     clusters = np.unique(strata * a.size + clusters, return_inverse=True)[1]  # blocks are named within their task
     if not clusters.any():
         clusters = np.arange(a.size)
-    reach = math.exp(_spread(weights * (a / mean_a - b / mean_b), strata, clusters))
-    return Estimate(mean_a / mean_b, mean_a / mean_b / reach, mean_a / mean_b * reach)
+    reach = math.exp(_spread(a / a.sum() - b / b.sum(), strata, clusters))
+    return Estimate(value, value / reach, value * reach)
 
 
 def over_runs(estimates: Sequence[Estimate], same_pairs: bool) -> Estimate:

@@ -20,7 +20,7 @@ from kerv_cli.base.durations import count
 from kerv_cli.engine.record import PHASES
 from kerv_cli.episodes.identity import stress_text
 from kerv_cli.lab.plan import seeds_text
-from kerv_cli.report.measures import Measures, Result, is_number
+from kerv_cli.report.measures import Result, is_number
 from kerv_cli.report.profiles import ENCODERS
 from kerv_cli.report.reprice import Priced
 from kerv_cli.report.statistics import Estimate
@@ -59,7 +59,6 @@ MEANINGS = {
     "tokens unverified": "executed tokens that the policy neither wrote nor accepted",
     "tokens per verification": "how many tokens one verification yields on average (acceptance length)",
     "pairs lost / won": "initial states that only {0}, and only the setting, solved",
-    "success, by difficulty": "unweighted mean over the groups of tasks; all other columns pool all tasks",
 }
 ASSUMES = (
     "Speed against the baseline by the cost model: the recorded decodes at a profile's costs, as if the other machine "
@@ -103,13 +102,9 @@ def _speed(row: Result, speed: Estimate) -> str:
     return interval(speed, unit="×") + (APART if apart else "")
 
 
-def cells_of(row: Result, of: Measures | None = None) -> Cells:
-    """Return a row of a study's table as text, by heading. The first `MAIN` are always shown.
-
-    Args:
-        of: The measures to show. If None, those that are pooled over all episodes.
-    """
-    of = of or row.measures
+def cells_of(row: Result) -> Cells:
+    """Return a row of a study's table as text, by heading. The first `MAIN` are always shown."""
+    of = row.measures
     return {
         "setting": row.label,
         "success": interval(of.success, ".0f", " %", 100.0),
@@ -265,16 +260,6 @@ def setting_tables(data: StudyData) -> Iterator[tuple[Any, Any, str]]:
             if seconds:
                 shares.append((phase, f"{1000 * seconds / decodes:.2f}", f"{seconds / total:.0%}"))
         yield ("phase", "ms per decode", "share"), shares, "time by phase"
-
-
-def suite_table(results: Sequence[Result]) -> list[Cells]:
-    """Return the page's table of settings. With several difficulty groups, further columns have their mean."""
-    rows = summary(results)
-    if any(";" in row.difficulty for row in results):
-        for cells, row in zip(rows, results, strict=True):
-            by_difficulty = cells_of(row, row.by_difficulty)
-            cells |= {f"{name}, by difficulty": by_difficulty[name] for name in ("success", *SPEEDS.values())}
-    return rows
 
 
 def task_table(results: Sequence[Result]) -> list[Cells]:

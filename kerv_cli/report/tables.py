@@ -7,7 +7,7 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
@@ -21,10 +21,8 @@ from kerv_cli.lab.plan import Episode, seeds_text
 from kerv_cli.lab.read import decodes_of, frame_of, how_to_run, loaded, whole_runs
 from kerv_cli.lab.store import Study
 from kerv_cli.report.measures import (
-    MACRO,
-    MICRO,
-    ONE_TASK,
-    Measures,
+    OVERALL,
+    PER_TASK,
     Result,
     Row,
     Speeds,
@@ -61,7 +59,7 @@ class StudyData:
     """A study (settings that are compared) with its stored episodes. Tables are computed on first use and then kept."""
 
     study: Study
-    # one row per stored episode. Columns as in `frame_of`, then difficulty, device, number format, threads.
+    # one row per stored episode. Columns as in `frame_of`, then device, number format, threads.
     episodes: pd.DataFrame
     # one table like `episodes` per run (command), all of the same code on the same kind of device. Empty if there are
     # fewer than three.
@@ -133,7 +131,7 @@ class StudyData:
         labels = list(map(attrgetter("label"), sorted(timed, key=attrgetter("speed"), reverse=True)))
         next_ones = dict(itertools.pairwise(labels))
         runs = [paired(run, next_ones) for run in self.runs or (self.episodes,)]
-        speeds = speedups_of_runs(runs, MICRO, self.same_pairs)
+        speeds = speedups_of_runs(runs, OVERALL, self.same_pairs)
         return [(label, speeds.get(label, Speeds()).episode_speedup) for label in labels]
 
     @functools.cached_property
@@ -153,11 +151,11 @@ class StudyData:
 
     @functools.cached_property
     def results(self) -> list[Result]:
-        return _results(self, MICRO)
+        return _results(self, OVERALL)
 
     @functools.cached_property
     def task_results(self) -> list[Result]:
-        return _results(self, ONE_TASK)
+        return _results(self, PER_TASK)
 
     @property
     def varied(self) -> list[str]:
@@ -230,8 +228,7 @@ def _with_new_seeds(episodes: pd.DataFrame) -> list[pd.DataFrame]:
 
 def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
     runtimes = pd.DataFrame([one.settings["runtime"] for one in study.settings], study.labels, list(RUNTIME))
-    difficulty = episodes["task"].map(functools.cache(difficulty_of))
-    labelled = episodes.assign(difficulty=difficulty).join(runtimes, on="label")
+    labelled = episodes.join(runtimes, on="label")
     # strings as Python objects: these frames are cut into hundreds of small ones, and arrow's arrays are slow at that
     names = map(str, labelled.select_dtypes("str"))
     return labelled.assign(**{name: _shared(labelled[name]) for name in names})
@@ -251,23 +248,13 @@ def dof_names(task: str, number: int) -> Sequence[str]:
     return list(map(str, range(number)))
 
 
-def difficulty_of(task: str) -> str:
-    for spec in specs().values():
-        if task in spec.tasks:
-            return spec.tasks[task].difficulty
-    return "other"
-
-
-def _results(data: StudyData, averaging: str) -> list[Result]:
-    def measured(way: str) -> Mapping[Any, Measures]:
-        speeds = speedups_of_runs(data.pairs_of_runs, way, data.same_pairs)
-        return measure(data.episodes, data.pairs, way, speeds)
-
-    pooled, by_difficulty = measured(averaging), measured(MACRO) if averaging == MICRO else {}
-    texts = data.episodes.reindex(columns=["label", "task", "difficulty", "seed", *_PROVENANCE])
+def _results(data: StudyData, by: Sequence[str]) -> list[Result]:
+    speeds = speedups_of_runs(data.pairs_of_runs, by, data.same_pairs)
+    measures = measure(data.episodes, data.pairs, by, speeds)
+    texts = data.episodes.reindex(columns=["label", "task", "seed", *_PROVENANCE])
     texts = texts.astype(object).where(texts.notna(), None)
     shared = {name: _joined(texts[name].unique()) for name in _PROVENANCE if texts[name].nunique(dropna=False) == 1}
-    where = texts["task"] if averaging == ONE_TASK else pd.Series("", texts.index)
+    where = texts["task"] if by == PER_TASK else pd.Series("", texts.index)
     groups: Any = texts.groupby([where, pd.Categorical(texts["label"], data.labels)], observed=True)
     results = []
     for (task, label), part in groups:
@@ -283,12 +270,10 @@ def _results(data: StudyData, averaging: str) -> list[Result]:
             where=task,
             task=_joined(sorted(set(part["task"]))),
             tasks=part["task"].nunique(),
-            difficulty=_joined(sorted(set(part["difficulty"]))),
             seeds=seeds_text(part["seed"].unique()),
             episodes=len(part),
             baseline=data.references[label],
-            measures=pooled[(task, label) if task else label],
-            by_difficulty=by_difficulty.get(label),
+            measures=measures[(task, label) if task else label],
             runs=len(data.pairs_of_runs),
             overrides=" ".join(setting.overrides),
             settings=flatten(without(setting.settings, NOT_DETERMINING - {"policy"})),
