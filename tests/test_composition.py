@@ -206,9 +206,9 @@ def test_a_method_needs_what_its_parts_read_and_nothing_else(overrides, wanted):
         ("method=ar runtime.workers=4", "runtime.workers=4"),
         ("method=ar record=0 record_size=64", "record_size=64"),
         ("method=ar episodes=2 seed=100007 world.horizon=9", ""),
-        ("rollout.ar_ms=20", "rollout.ar_ms=20"),
+        ("rollout.latency_ms=20", "rollout.latency_ms=20"),
         ("rollout.clock=real rollout.latency_ms=20", "rollout.latency_ms=20"),
-        ("rollout.clock=real rollout.latency=constant rollout.ar_ms=20", "rollout.ar_ms=20"),
+        ("rollout.clock=real rollout.latency=constant rollout.profile=x", "rollout.profile=x"),
     ],
 )
 def test_an_override_without_effect_is_found(words, idle):

@@ -176,17 +176,11 @@ def _profile_latency(settings: RolloutSettings, target: TargetDescription | None
     drafter = (DRAFTING, "feed") if DRAFTING in costs else ()
     if lacks := profile.lacks(("encode", "prefill", "verify", *drafter)):
         raise UsageError(f"rollout.profile={name}: {path} has no phase '{lacks[0]}', which this method needs")
-    ar_seconds = settings.rollout.ar_ms / 1000.0
-    whole = profile.decode(target.actions.longest(settings.chunk or target.chunk))
-    if ar_seconds and target.actions.code:
-        raise UsageError("rollout.ar_ms: chunks of this target differ in length; leave out rollout.ar_ms")
-    if ar_seconds and not whole:
-        raise UsageError(f"rollout.profile={name}: its AR decode takes no time; leave out rollout.ar_ms")
-    return profiled(profile, ar_seconds / whole if ar_seconds else 1.0)
+    return profiled(profile)
 
 
-def profiled(profile: Profile, scale: float = 1.0) -> Latency:
-    return lambda decode: scale * float(prices(work_of_record(decode), profile)[0])
+def profiled(profile: Profile) -> Latency:
+    return lambda decode: float(prices(work_of_record(decode), profile)[0])
 
 
 def _profile_path(settings: RolloutSettings) -> Path:

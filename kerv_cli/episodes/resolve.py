@@ -315,12 +315,12 @@ def idle_keys(settings: RolloutSettings) -> dict[str, str]:
     for kind in ArtifactPart.every().keys() - needed:
         idle[f"policy.artifacts.{kind}"] = f"method {settings.method} reads no {kind}"
     if timing.clock == WAITS:
-        names = "latency", "latency_ms", "profile", "ar_ms", "delay_compensation"
+        names = "latency", "latency_ms", "profile", "delay_compensation"
         idle |= dict.fromkeys(map("rollout.{}".format, names), "rollout.clock=waits: the world waits for every decode")
     elif timing.latency != CONSTANT:
         idle["rollout.latency_ms"] = f"rollout.latency={timing.latency}"
     if timing.clock == REAL and timing.latency != PROFILE:
-        idle["rollout.profile"] = idle["rollout.ar_ms"] = f"rollout.latency={timing.latency} reads no profile"
+        idle["rollout.profile"] = f"rollout.latency={timing.latency} reads no profile"
     if batch > 1:
         idle |= dict.fromkeys(("record", "record_size"), f"rollout.batch={batch}: episodes of a batch are not recorded")
     if not settings.record:

@@ -25,9 +25,6 @@ class TimingSettings:
     latency: str = choice(MEASURED, MEASURED, CONSTANT, PROFILE, help="clock=real: where latencies come from")
     latency_ms: float = number(0.0, 0, 600_000, help="latency=constant: milliseconds per decode")
     profile: str = setting("", "latency=profile: result file of `kerv bench`: its path, or its name in <results>/bench")
-    ar_ms: float = number(
-        0.0, 0, 600_000, help="latency=profile: scale it so that an autoregressive decode takes this many ms; 0: do not"
-    )
     delay_compensation: str = choice("none", "none", CHUNK, help="chunk: drop actions that come too late")
     batch: int = number(1, 1, 1024, help="episodes that are decoded together; above 1, no times are measured")
 
@@ -41,8 +38,6 @@ class TimingSettings:
             raise UsageError(
                 f"{prefix}batch={self.batch} with {prefix}clock=real: decodes of a batch have no times, use only one"
             )
-        if self.clock == REAL and self.latency == MEASURED and self.ar_ms:
-            raise UsageError(f"{prefix}ar_ms={self.ar_ms:g} scales a profile: set {prefix}latency=profile")
         if self.clock == REAL and self.latency == PROFILE and not self.profile:
             raise UsageError(
                 f"{prefix}latency=profile: name a document of 'kerv bench', such as {prefix}profile=mt10-vision-float32"
