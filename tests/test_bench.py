@@ -262,13 +262,3 @@ def test_a_model_that_does_not_fit_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("kerv_cli.bench.model.memory_of", lambda device: 8e9)
     words = ("target=openvla-7b", "dtype=float32", f"results={tmp_path}")
     assert "cpu has 8.0 GB" in refusal("bench", *words, code=2)
-
-
-@pytest.mark.parametrize(
-    "content", ["{}", '{"profile": {"prompt": 1, "tokens": 1, "phases": {"verify": {"rows": 1}}}}']
-)
-def test_a_file_without_a_profile_is_refused(content, tmp_path):
-    path = tmp_path / "other.json"
-    path.write_text(content)
-    with pytest.raises(CheckpointError, match="no latency profile"):
-        read_profile(path)

@@ -82,7 +82,6 @@ def test_a_failure_is_assigned_to_the_phase_in_which_it_happened():
     assert phase_of(0.3, 0.0) == "before contact"
     assert phase_of(0.019, 0.0) == "near contact"
     assert phase_of(0.03, 0.02) == phase_of(0.0, 0.01) == "after contact"  # a door's handle is 3 cm wide
-    assert phase_of(0.019, None) == "near or after contact"
     assert phase_of(0.02, None) == "before contact"
     assert phase_of(None, None) == "unknown"
 

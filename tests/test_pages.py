@@ -58,16 +58,9 @@ def test_more_columns_and_another_order_on_a_click(page):
     assert speeds == sorted(speeds, reverse=True)
 
 
-def test_a_phone_shows_the_page_without_scrolling_sideways(page):
-    page.set_viewport_size({"width": 390, "height": 800})
-    page.wait_for_timeout(300)
-    assert page.evaluate("document.documentElement.scrollWidth") <= 390
-    assert page.locator("figure.chart svg").first.bounding_box()["width"] <= 390
-
-
 def test_a_report_has_a_film_of_one_success_and_one_failure_per_method(tmp_path, monkeypatch):
     """Recordings are made up: what matters is which are chosen."""
-    study = threshold_study(["reach-v3"], episodes=30, radii=(20,))
+    study = threshold_study(["reach-v3"], episodes=12, radii=(20,))
     store, _ = swept(tmp_path, study)
     data = load_study(store)
     store.rollouts.mkdir(parents=True, exist_ok=True)

@@ -63,15 +63,13 @@ def test_no_phase_costs_less_than_its_floor(device, engine):
             assert one >= floors.seconds(kind, n)
 
 
-def test_shipped_profiles_are_the_computed_ones_and_not_below_a_floor():
+def test_shipped_profiles_are_the_computed_ones():
     shipped = {path.name for path in (ROOT / "results/bench").glob("*-openvla-7b*.json")}
     assert shipped == {f"{one.name}-profile.json" for one in projections(SETTINGS)}
     for one in projections(SETTINGS):
         path = ROOT / "results/bench" / f"{one.name}-profile.json"
         assert json.loads(path.read_text()) == one.document
         profile = read_profile(path)
-        for kind, (rows, seconds) in profile.phases.items():
-            assert all(cost >= one.floors.seconds(kind, n) for n, cost in zip(rows, seconds, strict=True))
         assert (profile.about["engine"], profile.about["projected"]) == (one.engine.name, True)
 
 

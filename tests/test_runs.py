@@ -55,12 +55,11 @@ def listed(results: Path, *words: str) -> list[dict[str, Any]]:
 
 
 def test_runs_are_viewed_by_their_ids_and_last_is_the_newest_with_recordings(policies, tmp_path, monkeypatch):
-    results, other = f"results={tmp_path}/results", f"results={tmp_path}/other"
+    results = f"results={tmp_path}/results"
     words = ["policy=vision", "policy.target=nano-vision", "task=reach-v3", "world.horizon=3", "record_size=32"]
-    for folder, methods in ((results, ("jacobi", "ar")), (other, ("jacobi",))):
-        shutil.copytree(policies / "artifacts", Path(folder.removeprefix("results=")) / "artifacts")
-        for method in methods:
-            works("rollout", f"method={method}", "episodes=1", *words, folder)
+    shutil.copytree(policies / "artifacts", tmp_path / "results/artifacts")
+    for method in ("jacobi", "ar"):
+        works("rollout", f"method={method}", "episodes=1", *words, results)
     works("rollout", "method=ar", "episodes=1", *FAST, results)
     ar, jacobi = (run["id"] for run in listed(tmp_path / "results", "kind=rollout")[1:])
     assert (ar.endswith("-ar"), jacobi.endswith("-jacobi")) == (True, True)
@@ -227,7 +226,7 @@ remove(run, database)
 """
 
 
-@pytest.mark.parametrize("moment", range(4))
+@pytest.mark.parametrize("moment", [0, 2])
 def test_a_removal_that_is_killed_can_be_repeated(copy, moment):
     name = next(run["id"] for run in listed(copy) if run["kind"] == "rollout")
     (copy / "rollouts" / name / "rollouts").mkdir(parents=True)

@@ -139,7 +139,7 @@ def figures(tmp_path, monkeypatch):
         f"{head},only_baseline,only_method",
         "micro over tasks,ar,ar,9,10,1,,,,0,0",
         "micro over tasks,one pass,ar,8,10,2.044,1.97,2.106,0.5,2,1",
-        "macro over difficulty groups,one pass,ar,8,10,3,2,4,0.5,2,1",  # an older table has two rows per setting
+        "macro over difficulty groups,one pass,ar,8,10,3,2,4,0.5,2,1",  # an older table
     )
     (tmp_path / "small.csv").write_text("\n".join(rows), encoding="utf-8")
     return module

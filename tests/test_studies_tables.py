@@ -380,7 +380,7 @@ def test_a_page_shows_hostile_names_as_text(tmp_path, monkeypatch):
 
 def test_the_interval_of_a_ratio_takes_the_run_as_a_cluster_from_three_runs_on(tmp_path):
     """Two further runs, in which the method takes 1.2 and 1.5 times as long, widen it by Student's t over the runs."""
-    study, said, before = threshold_study(["reach-v3", "push-v3"]), [], math.nan
+    study, said, before = threshold_study(["reach-v3", "push-v3"], 2, ()), [], math.nan
     for slower in (1.0, 1.2, 1.5):
         store, _ = swept(tmp_path, study, rerun="all")
         with store.database.writing() as connection:
@@ -404,7 +404,7 @@ def test_runs_with_seeds_of_their_own_are_the_only_cluster_of_a_ratio(tmp_path):
     """Each run adds a seed per task. The interval is Student's t over the three ratios, pairs are not added again."""
     said, alone = [], []
     for episodes in (1, 2, 3):
-        store, _ = swept(tmp_path, threshold_study(["reach-v3", "push-v3"], episodes))
+        store, _ = swept(tmp_path, threshold_study(["reach-v3", "push-v3"], episodes, ()))
         data = load_study(store)
         row = row_of(data.results, label="naive_sd")
         said.append((row["runs"], row["episodes"]))
@@ -421,7 +421,7 @@ def test_runs_with_seeds_of_their_own_are_the_only_cluster_of_a_ratio(tmp_path):
 def test_a_run_that_only_filled_gaps_is_no_run_of_its_own(tmp_path):
     tasks = ["reach-v3", "push-v3"]
     for episodes, used in ((1, tasks), (2, tasks), (3, tasks[:1]), (3, tasks)):
-        store, _ = swept(tmp_path, threshold_study(used, episodes))
+        store, _ = swept(tmp_path, threshold_study(used, episodes, ()))
     assert {row.runs for row in load_study(store).results} == {1}
 
 

@@ -102,8 +102,7 @@ def _film_values(
     values["slower"] = SLOWER
     if found.recording.exists() and (job is None or job.future.done()):
         film = film_of(inside(request, found.recording))
-        if film.facts.get("tokens"):
-            values["same"] = film.facts["tokens"] == tokens_hash(found.decodes()[0] if decodes is None else decodes)
+        values["same"] = film.facts.get("tokens") == tokens_hash(found.decodes()[0] if decodes is None else decodes)
         address = f"{request.base_url}episodes/{found.id}/recording.rrd"
         values |= {"film": film, "rerun": f"/rerun/?url={quote(address, safe='')}"}
     return values

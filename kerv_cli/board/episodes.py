@@ -44,7 +44,6 @@ PHASES = {
     "before contact": "the fingertips never came within 2 cm of the object, and did not move it",
     "near contact": "they came within 2 cm, and the object moved less than 1 cm",
     "after contact": "the object moved 1 cm or more",
-    "near or after contact": "they came within 2 cm; an older kerv did not store how far the object moved",
     "unknown": "the task has no object, or the distance was not stored",
 }
 
@@ -54,15 +53,13 @@ def phase_of(closest: float | None, moved: float | None) -> str:
 
     Args:
         closest: Least distance of the fingertips to the object, metres. None if unknown.
-        moved: How far the object moved after the fingertips came near it, metres. None if unknown.
+        moved: How far the object moved after the fingertips came near it, metres. None if they never did.
     """
     if closest is None:
         return "unknown"
     if moved is not None and moved >= MOVED:
         return "after contact"
-    if closest >= NEAR:
-        return "before contact"
-    return "near or after contact" if moved is None else "near contact"
+    return "before contact" if closest >= NEAR else "near contact"
 
 
 class Cell(NamedTuple):

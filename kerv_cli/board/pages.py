@@ -16,8 +16,7 @@ from starlette.responses import HTMLResponse, Response
 from kerv_cli.catalogue.entries import few
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import pulse
-from kerv_cli.report.measures import is_number
-from kerv_cli.report.summary import with_code
+from kerv_cli.report.summary import number, with_code
 
 TEMPLATES = Environment(
     loader=ChoiceLoader([PackageLoader("kerv_cli.board"), PackageLoader("kerv_cli.report")]),
@@ -39,11 +38,7 @@ def page_of(run: str) -> str:
     return f"/artifacts/{quote(run)}" if "/" in run else f"/studies/{quote(run)}"
 
 
-def figure(value: float) -> str:
-    return f"{value:.4g}" if is_number(value) else "–"
-
-
-TEMPLATES.filters |= {"few": few, "page_of": page_of, "figure": figure, "code": with_code}
+TEMPLATES.filters |= {"few": few, "page_of": page_of, "figure": number, "code": with_code}
 
 
 def database_of(request: Request) -> Database:

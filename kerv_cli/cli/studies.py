@@ -167,12 +167,11 @@ def print_study(data: StudyData, all_columns: bool = False, how: str = "") -> No
     """Print the table of a study and its note. `how` is what to type to see all columns."""
     from kerv_cli.lab.read import sweep_command
     from kerv_cli.report.summary import SummaryTable, not_in_turn
-    from kerv_cli.report.tables import split_values
 
     study = data.study
     how = how or f"kerv report study={study.name}{results_word(study.database.words)} --all"
     console().print(SummaryTable(data.results, all_columns, how))
-    commits = split_values(row.provenance["git_commit"] for row in data.results)
+    commits = {one for row in data.results for one in row.provenance["git_commit"].split(";")}
     if len(commits) > 1:
         typer.echo(f"its episodes are of {len(commits)} commits: {', '.join(sorted(one[:12] for one in commits))}")
     apart = not_in_turn(data.results)

@@ -5,8 +5,6 @@ CSV and JSON files, the terminal, the page, the board and the verdict are views 
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import math
 from collections.abc import Hashable, Mapping, Sequence
@@ -163,16 +161,7 @@ def columns_of(values: Mapping[str, Any]) -> Row:
 
 def csv_text(rows: Sequence[Row]) -> str:
     """Return rows as CSV text with six significant digits. Missing values are empty cells."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(rows[0])
-    for row in rows:
-        writer.writerow([f"{value:.6g}" if type(value) is float else value for value in map(_present, row.values())])
-    return text.getvalue()
-
-
-def _present(value: Any) -> Any:
-    return "" if value is None or (isinstance(value, float) and math.isnan(value)) else value
+    return pd.DataFrame(rows).to_csv(index=False, float_format="%.6g", lineterminator="\n")
 
 
 def is_number(value: Any) -> bool:
@@ -213,7 +202,7 @@ def measure(
     counted = episodes.assign(episodes=1, successes=episodes["success"].astype(bool))
     counts = counted.groupby(by)[["episodes", "successes", "steps", "decodes", "deviation_count"]].sum()
     counts = counts.join(pairs.groupby(by)[outcomes].sum()).fillna(0).astype(int)
-    numbers: dict[Any, dict[str, int]] = counts.to_dict("index")
+    numbers: dict[Any, Any] = counts.to_dict("index")
     means = _means(episodes, by).join(pairs.groupby(by)[["same_run", "same_block"]].mean())
     phases: dict[Any, Any] = means[list(_PHASES)].to_dict("index")
     of_plugins: dict[Any, Any] = means[added].to_dict("index")

@@ -7,7 +7,6 @@ chart's parameter `picked` to the setting's label.
 from __future__ import annotations
 
 import functools
-import io
 import itertools
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -19,14 +18,13 @@ import altair as alt
 import numpy as np
 import pandas as pd
 import vl_convert
-from PIL import Image
 
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import write_if_changed
 from kerv_cli.report.measures import Result, is_number
 from kerv_cli.report.summary import MAIN, summary
-from kerv_cli.report.tables import NO_STRESS, StudyData
+from kerv_cli.report.tables import NO_STRESS, StudyData, dof_names
 
 INK, MUTED, BLUE, GREEN = "#1f2933", "#6b7785", "#0b6fb8", "#2a9d6f"
 COLOURS = (BLUE, "#d1495b", GREEN, "#8d5fd3", "#e08e1b", "#3aa6b9", "#7a5c3e")  # distinct when colour-blind
@@ -158,7 +156,7 @@ def _tradeoff(results: Sequence[Result], loss: float, colours: Mapping[str, str]
         DIFFERENCE: (-loss, f"right of the dashed line: loses less than {loss:g} points"),
     }
     charts: list[alt.LayerChart] = []
-    datasets: dict[str, Sequence[Point]] = {}
+    datasets: dict[str, Any] = {}
     for column, (bound, hint) in panels.items():
         points = _points(results, column, dict.fromkeys(labels, ("", None)))
         for point in points:
@@ -217,7 +215,8 @@ def acceptance_figure(data: StudyData) -> alt.ConcatChart:
 
     The shares count only tokens whose predecessors in the draft were all accepted.
     """
-    dofs = data.dofs(max(len(tally.reached) for tally in data.tallies.values()))
+    number = max(len(tally.reached) for tally in data.tallies.values())
+    dofs = dof_names(data.task_results[0].task, number)
     places: tuple[list[Point], list[Point], list[Point]] = [], [], []
     for label, tally in data.tallies.items():
         reached, accepted = tally.by_position
@@ -263,7 +262,7 @@ CURVES = {
 def curves_figure(log: pd.DataFrame) -> alt.ConcatChart:
     best = _best_step(log)
     charts: list[alt.LayerChart] = []
-    datasets: dict[str, Sequence[Point]] = {}
+    datasets: dict[str, Any] = {}
     for name in log.columns.drop("step"):
         datasets[str(name)] = log[["step", name]].dropna().set_axis(["step", "value"], axis=1).to_dict("records")
         title = CURVES.get(str(name), str(name).replace("_", " ").replace("l1 ", "error of "))
@@ -276,7 +275,7 @@ def curves_figure(log: pd.DataFrame) -> alt.ConcatChart:
     return _chart(charts, _ACROSS, datasets)
 
 
-def _chart(panels: list[alt.LayerChart], across: int, datasets: Mapping[str, Sequence[Point]]) -> alt.ConcatChart:
+def _chart(panels: list[alt.LayerChart], across: int, datasets: Mapping[str, Any]) -> alt.ConcatChart:
     # altair copies the data of a chart again and again, unless only its name is there
     chart = alt.concat(*panels, columns=across, spacing=28, config=_CONFIG, datasets=datasets)
     chart.params = [alt.param("picked", value="").param]  # `add_params` would copy the panels again and again
@@ -287,9 +286,7 @@ def png(figure: alt.ConcatChart, title: str, subtitle: str) -> bytes:
     """Return a chart with a heading as a PNG file. The same chart gives the same bytes."""
     heading = alt.Title(title, subtitle=subtitle, fontSize=17, subtitleFontSize=12, offset=16)
     spec = figure.properties(title=heading, background="white", padding=14).to_dict(validate=False)
-    buffer = io.BytesIO()  # written again: the renderer hardly compresses
-    Image.open(io.BytesIO(vl_convert.vegalite_to_png(spec, scale=2))).convert("RGB").save(buffer, "png", optimize=True)
-    return buffer.getvalue()
+    return vl_convert.vegalite_to_png(spec, scale=2)
 
 
 @functools.cache

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bisect
-import functools
 import math
 from collections.abc import Sequence
 from statistics import NormalDist
@@ -33,27 +32,25 @@ class PairedCounts(NamedTuple):
     neither: float
 
 
+_Z = NormalDist().inv_cdf(0.975)
 NO_ESTIMATE = Estimate(math.nan, math.nan, math.nan)
 # Messages say "more than 10,000" above this, because nobody runs so many pairs.
 MOST_PAIRS = 10_000
 
 
-def wilson(successes: float, episodes: float, confidence: float = 0.95) -> Estimate:
+def wilson(successes: float, episodes: float) -> Estimate:
     """Estimate a success rate with its Wilson score interval (Newcombe, Statistics in Medicine 17, 1998, method 3).
 
     It is written out here because importing `scipy.stats` takes 60 MB of memory.
     """
     if episodes == 0:
         return NO_ESTIMATE
-    rate, z = successes / episodes, _quantile(0.5 + confidence / 2)
+    rate, z = successes / episodes, _Z
     middle, scale = 2 * successes + z**2, 2 * (episodes + z**2)
     reach = z * math.sqrt(z**2 + 4 * successes * (1 - rate))
     low = (middle - reach) / scale if successes else 0.0
     high = (middle + reach) / scale if successes < episodes else 1.0
     return Estimate(rate, low, high)
-
-
-_quantile = functools.cache(NormalDist().inv_cdf)
 
 
 def paired_difference(counts: PairedCounts) -> Estimate:

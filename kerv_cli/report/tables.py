@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from kerv_cli.base.errors import UsageError
@@ -32,7 +31,7 @@ from kerv_cli.report.measures import (
     speedups_of_runs,
 )
 from kerv_cli.report.statistics import Estimate
-from kerv_cli.report.tally import Tally
+from kerv_cli.report.tally import READ, Tally
 from kerv_cli.targets.provenance import PACKAGES
 from kerv_cli.worlds import specs
 
@@ -79,7 +78,7 @@ class StudyData:
         present = set(self.episodes["label"])
         return [label for label in self.study.labels if label in present]
 
-    @property
+    @functools.cached_property
     def absent(self) -> list[Episode]:
         """Episodes that the study asks for and that are not stored yet."""
         present = set(self.episodes[["label", "task", "seed"]].itertuples(index=False, name=None))
@@ -144,7 +143,7 @@ class StudyData:
                 continue
             numbers, tally = own.sort_values("seed", kind="stable")["episode"].tolist()[:MOST_TALLIED], NO_TALLY
             for first in range(0, len(numbers), _AT_ONCE):
-                decodes = decodes_of(self.study, numbers[first : first + _AT_ONCE], ("rounds",))
+                decodes = decodes_of(self.study, numbers[first : first + _AT_ONCE], READ)
                 tally += Tally.of_rounds(decodes["rounds"].combine_chunks().flatten())
             tallies[label] = tally
         return tallies
@@ -161,9 +160,6 @@ class StudyData:
     def varied(self) -> list[str]:
         keys = dict.fromkeys(itertools.chain.from_iterable(one.varies for one in self.study.settings))
         return list(keys | ({self.study.axis: None} if "." in self.study.axis else {}))
-
-    def dofs(self, number: int) -> Sequence[str]:
-        return dof_names(str(self.episodes["task"].iloc[0]), number)
 
 
 def references_of(settings: Sequence[Setting], baseline: str) -> dict[str, str]:
@@ -230,14 +226,8 @@ def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
     runtimes = pd.DataFrame([one.settings["runtime"] for one in study.settings], study.labels, list(RUNTIME))
     labelled = episodes.join(runtimes, on="label")
     # strings as Python objects: these frames are cut into hundreds of small ones, and arrow's arrays are slow at that
-    names = map(str, labelled.select_dtypes("str"))
-    return labelled.assign(**{name: _shared(labelled[name]) for name in names})
-
-
-def _shared(texts: pd.Series) -> pd.Series:
-    """Return the texts as Python objects, with one object for all equal texts."""
-    codes, values = pd.factorize(texts, use_na_sentinel=False)
-    return pd.Series(np.asarray(values, object)[codes], texts.index, dtype=object)
+    names: list[str] = labelled.select_dtypes("str").columns.tolist()
+    return labelled.astype(dict.fromkeys(names, "category")).astype(dict.fromkeys(names, object))
 
 
 def dof_names(task: str, number: int) -> Sequence[str]:
@@ -343,7 +333,3 @@ def differences(first: Row, second: Row) -> list[Row]:
 
 def _joined(values: Iterable[object]) -> str:
     return ";".join(dict.fromkeys(str(value) for value in dict.fromkeys(values) if value is not None))
-
-
-def split_values(texts: Iterable[object]) -> set[str]:
-    return set(";".join(map(str, texts)).split(";"))

@@ -17,6 +17,10 @@ from kerv_cli.engine.record import DecodeRecord
 if TYPE_CHECKING:
     import pyarrow as pa
 
+# Columns of stored decodes that `Tally.of_rounds` reads
+_FIELDS = ("mode", "start", "tree_size", "accepted", "drafted", "target_tokens", "threshold")
+READ = tuple(map("rounds.list.element.{}".format, _FIELDS))
+
 
 @dataclass(frozen=True)
 class Tally:

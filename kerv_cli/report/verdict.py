@@ -6,6 +6,7 @@ baseline's success rate is below `SOLVED`, no setting is recommended.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -64,16 +65,13 @@ def choose(rows: Sequence[Result], loss: float) -> Choice:
         best = _fastest(passed)
         choice = replace(choice, chosen=best.label)
     else:
-        needed, reached = 0.0, {}
-        for row in order:
-            # a setting is tested only after all safer ones have passed, so it needs the most pairs of all of these
-            needed = max(needed, stats.pairs_to_settle(row.measures.counts, loss / POINTS))
-            if math.isfinite(needed):
-                reached[row.label] = needed
-        if not reached:
+        # a setting is tested only after all safer ones have passed, so it needs the most pairs of all of these
+        each = (stats.pairs_to_settle(row.measures.counts, loss / POINTS) for row in order)
+        needed = list(itertools.takewhile(math.isfinite, itertools.accumulate(each, max)))
+        if not needed:
             return choice
-        best = _fastest(order[: len(reached)])  # `needed` never falls
-        choice = replace(choice, candidate=best.label, candidate_pairs=reached[best.label])
+        best = _fastest(order[: len(needed)])
+        choice = replace(choice, candidate=best.label, candidate_pairs=needed[order.index(best)])
     return replace(choice, episode_speedup=best.measures.episode_speedup, runs=best.runs)
 
 
@@ -131,7 +129,8 @@ def question(results: Sequence[Result], loss: float) -> str:
 
 def sentence(choice: Choice, loss: float, baseline: str) -> str:
     if choice.is_unsolved:
-        return unsolved(baseline, choice.baseline_success)
+        share = f"{100 * choice.baseline_success:.0f} %"
+        return f"{baseline} does not solve these tasks ({share} of its episodes succeed), so no setting is recommended"
     bound = f"loses less than {loss:g} points of success against {baseline}"
     if choice.chosen:
         return f"{choice.chosen} {bound} (95 % confidence, {count(choice.pairs, 'pair')}){_speed(choice)}"
@@ -160,13 +159,6 @@ def order_of(by_speed: Sequence[tuple[str, stats.Estimate]]) -> str:
         text += f"{label} {'>' if speed.low > 1 else '≈'} "
     apart = " (≈: these episodes cannot tell the two apart)" if "≈" in text else ""
     return f"{text}{by_speed[-1][0]}{apart}" if by_speed else ""
-
-
-def unsolved(baseline: str, success: float) -> str:
-    return (
-        f"{baseline} does not solve these tasks ({100 * success:.0f} % of its episodes succeed), so no setting is "
-        "recommended"
-    )
 
 
 def _speed(choice: Choice) -> str:
