@@ -4,10 +4,8 @@ import errno
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -18,7 +16,6 @@ from kerv_cli.base.errors import CheckpointError, StorageError
 from kerv_cli.base.files import (
     atomic_path,
     clean,
-    is_left_over,
     read_json,
     sha256_of,
     temporary_beside,
@@ -29,43 +26,16 @@ from kerv_cli.base.files import (
 from kerv_cli.targets.checkpoint import Description, read_description, save_module
 
 
-def of_process(path: Path, pid: int, host: str = "") -> Path:
-    """The name that `temporary_beside` gives in another process."""
-    name = temporary_beside(path).name.replace(f".{os.getpid()}-", f".{pid}-")
-    return path.with_name(name.replace(socket.gethostname().replace(".", "-"), host) if host else name)
-
-
-@pytest.fixture
-def dead():
-    child = subprocess.Popen([sys.executable, "-c", ""])
-    child.wait()
-    return child.pid
-
-
-def test_only_what_a_dead_process_left_is_left_over(tmp_path, dead):
-    theirs, mine = of_process(tmp_path / "a.b.json", dead), temporary_beside(tmp_path / "a.b.json")
-    far = of_process(tmp_path / "a.b.json", 1, "elsewhere")
-    for path in (theirs, mine, far, tmp_path / ".hidden.tmp", tmp_path / "a.b.json", tmp_path / ".x.1-00.tmp"):
-        path.touch()
-    assert [path for path in tmp_path.iterdir() if is_left_over(path)] == [theirs]
-    for path in (far, theirs, mine):
-        os.utime(path, (0, time.time() - 8 * 24 * 3600))
-    assert [is_left_over(path) for path in (far, mine)] == [False, sys.platform == "linux"]  # this process is younger
-    mine.touch()
-    folder = of_process(tmp_path / "cell", dead)
-    folder.mkdir(parents=True)
-    (folder / theirs.name).touch()
-    assert clean(tmp_path) == sorted([theirs, folder])  # a left-over folder goes with its content
-    assert not folder.exists()
-    assert mine.exists()
-
-
-def test_the_next_write_removes_what_a_killed_one_left(tmp_path, dead):
-    left = of_process(tmp_path / "value.json", dead)
-    left.touch()
-    with atomic_path(tmp_path / "other.json") as temporary:
-        temporary.write_text("new")
-    assert [path.name for path in tmp_path.iterdir()] == ["other.json"]
+def test_the_next_write_removes_what_a_killed_one_left(tmp_path, monkeypatch):
+    left = temporary_beside(tmp_path / "cell")
+    left.mkdir()
+    (left / "file").touch()
+    write_json(tmp_path / "a.json", 1)
+    assert left.is_dir()  # perhaps its process lives
+    monkeypatch.setattr(files, "LEFT_OVER_SECONDS", -1)
+    files._clean_once.cache_clear()
+    write_json(tmp_path / "b.json", 1)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.json", "b.json"]
 
 
 def write(folder: Path, text: str) -> None:
@@ -128,12 +98,13 @@ files.write_folder(Path(sys.argv[1]), lambda new: (new / "file").write_text("new
 
 
 @pytest.mark.parametrize("moment", [1, 2, 3])
-def test_a_kill_while_a_folder_is_replaced_leaves_a_whole_one(store, moment):
+def test_a_kill_while_a_folder_is_replaced_leaves_a_whole_one(store, moment, monkeypatch):
     run = subprocess.run([sys.executable, "-c", SIGKILLED, str(store), str(moment)], check=False)
     assert run.returncode < 0
     assert (store / "file").read_text() == ("new" if moment == 3 else "old")
-    assert len([path for path in store.parent.iterdir() if is_left_over(path)]) == 1
+    assert len(list(store.parent.glob(".*.tmp"))) == 1
     write(store, "newest")
+    monkeypatch.setattr(files, "LEFT_OVER_SECONDS", -1)
     clean(store.parent)
     assert_alone(store, "newest")
 

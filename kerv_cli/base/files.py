@@ -1,7 +1,6 @@
 """Write files and folders atomically (complete or not at all); read text, JSON and YAML; compute hashes.
 
-Files and folders have a temporary name until they are complete. This name begins with a dot and contains the machine
-and the process: `.<name>.<host>.<process id>-<8 hex digits>.tmp`.
+Files and folders have a temporary name until they are complete: `.<name>.<16 hex digits>.tmp`.
 """
 
 from __future__ import annotations
@@ -12,14 +11,10 @@ import errno
 import fcntl
 import functools
 import hashlib
-import itertools
 import json
 import os
-import re
 import secrets
 import shutil
-import socket
-import stat
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -27,19 +22,9 @@ from typing import Any
 
 from kerv_cli.base.errors import CheckpointError, StorageError, UsageError
 
-MOST_TEXT = 2**28
-"""Maximum size of a JSON file in bytes. kerv's own files are far smaller."""
-MOST_YAML = 2**18
-"""Maximum size of a YAML file in bytes. Reading one takes ten seconds per megabyte."""
-MOST_VALUES = 20_000
-"""Maximum number of values in a YAML file, nested values included. A value that an alias repeats counts again."""
-MOST_BYTES = 2**36
-"""Maximum size of a file of weights or of a table in bytes."""
+LEFT_OVER_SECONDS = 24 * 3600.0
+"""A temporary path that nothing has changed for so long was left by a process that was killed."""
 
-CLOCKS_DIFFER_SECONDS = 3600.0
-"""The clock of a network folder may be this many seconds behind this machine's clock."""
-
-_TEMPORARY = re.compile(r"\..+\.(?P<host>[^/]+?)\.(?P<pid>\d+)-[0-9a-f]{8}\.tmp")
 _OF_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM)
 
 
@@ -193,26 +178,9 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
-def regular(path: Path, most: int = MOST_BYTES) -> Path:
-    """Return the path of a regular file of at most `most` bytes. Reading a pipe could wait forever.
-
-    Anything else is an OSError, a larger file a ValueError.
-    """
-    status = os.stat(path)
-    if not stat.S_ISREG(status.st_mode):
-        raise OSError(errno.EINVAL, "it is no regular file", str(path))
-    if status.st_size > most:
-        raise ValueError(f"{path} has {status.st_size} bytes, more than the {most} that kerv reads")
-    return Path(path)
-
-
-def read_text(path: Path, most: int = MOST_TEXT) -> str:
-    return regular(path, most).read_text(encoding="utf-8")
-
-
 def read_json(path: Path) -> Any:
     try:
-        return json.loads(read_text(path))
+        return json.loads(path.read_bytes())
     except FileNotFoundError as error:
         raise CheckpointError(f"{path} is missing") from error
     except (OSError, ValueError, RecursionError) as error:
@@ -231,11 +199,8 @@ def read_yaml_lines(path: Path, what: str) -> tuple[dict[str, Any], dict[str, in
     import yaml
 
     lines: dict[str, int] = {}
-    noted = itertools.count(1)
 
     def note(node: yaml.Node | None, prefix: str) -> None:
-        if next(noted) > MOST_VALUES:
-            raise UsageError(f"{path}: its aliases expand it to more than {MOST_VALUES} values: write fewer")
         if isinstance(node, yaml.SequenceNode):
             for index, child in enumerate(node.value):
                 note(child, f"{prefix}{index}.")
@@ -248,7 +213,7 @@ def read_yaml_lines(path: Path, what: str) -> tuple[dict[str, Any], dict[str, in
                 note(child, f"{name}.")
 
     try:
-        loader = yaml.SafeLoader(read_text(path, MOST_YAML))
+        loader = yaml.SafeLoader(path.read_text(encoding="utf-8"))
         node = loader.get_single_node()
         note(node, "")
         value = loader.construct_document(node) if node else {}
@@ -279,33 +244,16 @@ def _sha256(path: str, inode: int, size: int, changed: int) -> str:
 
 
 def temporary_beside(path: Path) -> Path:
-    mark = f"{_host()}.{os.getpid()}-{secrets.token_hex(4)}"
     name = path.name.encode()[:150].decode(errors="ignore")
-    return path.with_name(f".{name}.{mark}.tmp")
+    return path.with_name(f".{name}.{secrets.token_hex(8)}.tmp")
 
 
-def _host() -> str:
-    return socket.gethostname().replace(".", "-")
-
-
-def is_left_over(path: Path) -> bool:
-    """Return whether a process of this machine has left `path`, a temporary file or folder, and has ended."""
-    match = _TEMPORARY.fullmatch(path.name)
-    if match is None or match["host"] != _host():
-        return False
-    try:
-        written = path.stat().st_mtime
-    except OSError:  # it was renamed or removed meanwhile
-        return False
-    return not is_alive(int(match["pid"]), written + CLOCKS_DIFFER_SECONDS)
-
-
-def clean(folder: Path) -> list[Path]:
-    """Remove the temporary paths of ended processes from a folder, and return those that it tried to remove."""
-    paths = [path for path in folder.glob(".*.tmp") if is_left_over(path)]
-    for path in paths:
-        remove(path)
-    return sorted(paths)
+def clean(folder: Path) -> None:
+    """Remove the temporary paths that killed processes left in a folder."""
+    for path in folder.glob(".*.tmp"):
+        with contextlib.suppress(OSError):  # it was renamed or removed meanwhile
+            if time.time() - path.lstat().st_ctime > LEFT_OVER_SECONDS:
+                remove(path)
 
 
 _clean_once = functools.cache(clean)
@@ -319,22 +267,3 @@ def remove(path: Path) -> None:
     else:
         with contextlib.suppress(OSError):
             path.unlink()
-
-
-def is_alive(pid: int, seen: float) -> bool:
-    """Return whether a process of this machine, alive at the time `seen` (seconds since 1970), is still alive.
-
-    On Linux, a process that got the same id later does not count. On other systems any process with this id counts.
-    """
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        pass
-    try:
-        ticks = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19])
-        age = time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
-    except (OSError, AttributeError):
-        return True
-    return time.time() - age <= seen + 1.0  # the kernel counts in ticks of about 0.01 s

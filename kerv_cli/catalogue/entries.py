@@ -18,7 +18,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
-from kerv_cli.base.files import clean, read_mapping, read_text, set_aside, sha256_of, unfinished, visible
+from kerv_cli.base.files import clean, read_mapping, set_aside, sha256_of, unfinished, visible
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.paths import shipped_dir
 from kerv_cli.base.registry import ArtifactPart
@@ -272,7 +272,7 @@ def artifact_entry(folder: Path, kind: str) -> RunEntry:
         sha256 = str(value.get("sha256") or (sha256_of(_description(folder, kind)) if value else ""))
         state = "complete" if value or (folder / WEIGHTS).is_file() else "begun"  # copied weights have no description
         if (folder / LOG).is_file():
-            rows = list(csv.DictReader(read_text(folder / LOG).splitlines()))
+            rows = list(csv.DictReader((folder / LOG).read_text().splitlines()))
             steps, step = int(settings.get("train", {}).get("steps", 0)), float(rows[-1]["step"]) if rows else 0.0
             state = "complete" if step >= steps else f"step {step:.0f} of {steps}"
         if value.get("kind") == "datastore":

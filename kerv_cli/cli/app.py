@@ -6,7 +6,6 @@ Each of kerv's own commands is in a file of this folder, which is imported when 
 from __future__ import annotations
 
 import os
-import textwrap
 from typing import Annotated, Any
 
 import typer
@@ -46,12 +45,6 @@ class Commands(FastFlags, TyperGroup):
         family = Commands(name=cmd_name, help=help, short_help=help, no_args_is_help=True, rich_markup_mode=None)
         family.context_settings, family.prefix = CONTEXT, f"{name} "
         return family
-
-    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
-        found: list[Any] = super().shell_complete(ctx, incomplete)
-        for one in found:  # on one line, because fish completes each line of the answer
-            one.help = one.help and textwrap.shorten(one.help, 45, placeholder=" …")
-        return found
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         name = " ".join(args[:2])  # names of two words, as in `demos import`, are tried first

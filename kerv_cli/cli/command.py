@@ -1,7 +1,7 @@
 """Declare the commands of `kerv`: the decorator `command` turns a function into the command of that name.
 
 The decorator puts the function into kerv's registry. From that entry (a `Part` of kind `command`) this module makes
-typer's command with its options, settings, help and completion. The function is written as for typer. kerv fills in
+typer's command with its options, settings and help. The function is written as for typer. kerv fills in
 three of its parameters. All other parameters are typer's options:
 
 - `settings`: The command's settings, composed and checked. The command then has the option --cfg.
@@ -23,7 +23,7 @@ from typing import Annotated, Any, cast
 import typer
 from typer.core import TyperCommand
 
-from kerv_cli.base.config import compose, groups, plain_text
+from kerv_cli.base.config import compose, plain_text
 from kerv_cli.base.errors import UnknownName
 from kerv_cli.base.paths import check_writable
 from kerv_cli.base.registry import MODULES, NoSettings, Part, parts
@@ -84,16 +84,6 @@ def fields_of(settings: Any) -> dict[str, Field[Any]]:
     return {one.name: one for one in fields(settings)}
 
 
-def top_keys(part: Command) -> list[str]:
-    """Return the names that an override of this command can begin with: `threshold` for `threshold.r=5`."""
-    if part.settings is NoSettings:
-        return []
-    keys = list(part.typed)
-    for schema in schemas_of(part):
-        keys += [*choices_of(schema), *fields_of(schema)]
-    return [key for key in dict.fromkeys(keys) if key not in part.typed.values()]
-
-
 def commands(words: str = "") -> dict[str, Command]:
     """Return the commands whose names begin with `words`, by name, in the order of the help.
 
@@ -128,26 +118,14 @@ def _with_settings(cfg: Cfg = False) -> None:
     pass
 
 
-def _values(part: Command, key: str) -> list[str]:
-    if key == "task":
-        from kerv_cli.worlds import task_names
-
-        return task_names()
-    for schema in schemas_of(part):
-        if key in choices_of(schema):
-            return groups()[key]
-        if key in fields_of(schema):
-            return list(fields_of(schema)[key].metadata.get("names", ()))
-    return []
-
-
-def _split(part: Command, typed: list[str], named: bool) -> tuple[list[str], list[str]]:
-    keys = set(top_keys(part))
+def _split(part: Command, typed: list[str]) -> tuple[list[str], list[str]]:
+    """Divide what was typed into overrides and names."""
+    keys = {*choices_of(part.settings), *fields_of(part.settings)}
     filters = set(re.findall(r"(\w+)=", part.help.partition("\n\nNAME: ")[2]))
     overrides, names = [], []
     for word in typed:
         key, equals, _ = word.partition("=")
-        if not named or (equals and key.lstrip("+").split(".")[0] in keys):
+        if equals and key.lstrip("+").split(".")[0] in keys:
             overrides.append(word)
         elif equals and re.fullmatch(r"[\w.]+", key) and key not in filters and not Path(word).exists():
             raise UnknownName("key", key, sorted(keys | filters))
@@ -192,7 +170,7 @@ class CommandWithSettings(FastFlags, TyperCommand):
 
         part, options = self.part, ctx.params
         with chosen_store(ctx.args) as words:
-            overrides, names = _split(part, words, "names" in self.arguments)
+            overrides, names = _split(part, words) if "names" in self.arguments else (words, [])
             given: dict[str, Any] = {"overrides": overrides, "names": names}
             if "settings" in self.arguments:
                 given["settings"] = _settings(part, overrides, options.pop("cfg"))
@@ -207,24 +185,6 @@ class CommandWithSettings(FastFlags, TyperCommand):
                 device_of(given["settings"].runtime)
             with noted(line):
                 part.code(**{name: given[name] for name in self.arguments}, **options)
-
-    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
-        """Complete an option or an override: `me` to `method=`, and `method=s` to every method that begins with s.
-
-        bash passes `method`, `=` and `s` as three words, other shells pass one.
-        """
-        if incomplete.startswith("-"):
-            return super().shell_complete(ctx, incomplete)
-        from typer._click.shell_completion import CompletionItem
-
-        keys, before = top_keys(self.part), ["", *filter("=".__ne__, ctx.args)][-1]
-        key, equals, _ = incomplete.partition("=")
-        prefix, names, suffix = "", keys, "="
-        if before in keys:
-            names, suffix = _values(self.part, before), ""
-        elif equals:
-            prefix, names, suffix = f"{key}=", _values(self.part, key), ""
-        return [CompletionItem(f"{prefix}{x}{suffix}") for x in names if f"{prefix}{x}".startswith(incomplete)]
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
         below = commands(self.part.name)

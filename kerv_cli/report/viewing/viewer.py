@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any
 from PIL import Image
 
 from kerv_cli.base.errors import KervError, UsageError
-from kerv_cli.base.files import regular
 
 if TYPE_CHECKING:
     from rerun.chunk import Chunk, RrdReader
@@ -114,10 +113,8 @@ def read_chunks(path: Path) -> tuple[RrdReader, list[Chunk]]:
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # rerun only warns if the end of the file is missing
         try:
-            reader = RrdReader(regular(path))
+            reader = RrdReader(path)
             chunks = list(reader.stream())
-        except FileNotFoundError as error:
-            raise KervError(f"{path} is missing") from error
         except (RuntimeError, OSError, ValueError, Warning) as error:
             reason = "its end is missing" if isinstance(error, Warning) else str(error).splitlines()[0]
             raise KervError(f"{path} is damaged ({reason}): record the episode again") from error

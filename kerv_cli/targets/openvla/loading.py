@@ -20,7 +20,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import regular, sha256_of, visible
+from kerv_cli.base.files import sha256_of, visible
 from kerv_cli.targets.openvla.config import CONFIG, Shape
 from kerv_cli.targets.openvla.network import OpenVLAModel
 
@@ -62,7 +62,7 @@ class Shards:
 @contextlib.contextmanager
 def _open_tensors(path: Path) -> Iterator[Any]:
     try:
-        with safe_open(regular(path), framework="pt", device="cpu") as handle:
+        with safe_open(path, framework="pt", device="cpu") as handle:
             yield handle
     except (SafetensorError, OSError, ValueError) as error:
         raise CheckpointError(f"{path} is missing, cut short or damaged ({error}): download it again") from error

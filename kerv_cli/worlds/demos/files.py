@@ -26,7 +26,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import atomic_path, regular
+from kerv_cli.base.files import atomic_path
 
 FORMAT = "1"  # of the episode files
 # same names in the file; `initial_state` is called `rand_vec` there
@@ -218,7 +218,7 @@ MOST_EXPANDED = 2**30  # bytes of a table in memory
 def foreign_table(path: Path, columns: Sequence[str]) -> pa.Table:
     """Read columns of a Parquet file of another program, which may be huge in memory. Ignore those that it lacks."""
     total = 0
-    with pq.ParquetFile(regular(path)) as file:
+    with pq.ParquetFile(path) as file:
         chosen = [column for column in file.schema_arrow.names if column in columns]
         schema = pa.schema([file.schema_arrow.field(column) for column in chosen], file.schema_arrow.metadata)
         batches = []

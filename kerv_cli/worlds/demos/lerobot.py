@@ -24,7 +24,7 @@ import pyarrow.compute as pc
 from PIL import Image
 
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
-from kerv_cli.base.files import read_mapping, regular, write_folder, write_json
+from kerv_cli.base.files import read_mapping, write_folder, write_json
 from kerv_cli.base.paths import as_path
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, action_limits
 from kerv_cli.worlds import EnvironmentPart
@@ -321,7 +321,7 @@ def _pictures(cells: pa.ChunkedArray, folder: Path, path: Path) -> Iterator[np.n
         value = cell.as_py()
         data = value.get("bytes")
         place = path if data else folder / str(value.get("path"))
-        with _reading(place), Image.open(io.BytesIO(data) if data else regular(place)) as image:
+        with _reading(place), Image.open(io.BytesIO(data) if data else place) as image:
             yield np.asarray(image.convert("RGB"))
 
 
@@ -334,7 +334,7 @@ def _video_frames(path: Path, start: float, rate: float, count: int) -> Iterator
     done, half = 0, 0.5 / rate
     with _reading(path):
         try:
-            with av.open(str(regular(path))) as container:
+            with av.open(str(path)) as container:
                 stream = container.streams.video[0]
                 if start > 0:
                     container.seek(int(start / float(stream.time_base)), stream=stream)
