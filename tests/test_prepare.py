@@ -50,6 +50,7 @@ def results(policies, tmp_path, monkeypatch):
 def test_tasks_and_demonstrations_are_those_of_the_target(command):
     plan = " ".join(told(*command.split(), MINE, "--plan").split())
     assert "of 1 task" in plan
+    assert re.search(r"about \d+ s \(from a few steps, measured now\)", plan)
     assert "2 tasks" in " ".join(told(*command.split(), MINE, "task=[reach,push]", "--plan").split())
 
 

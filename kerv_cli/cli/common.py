@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import typer
 
-from kerv_cli.base.durations import about
+from kerv_cli.base.durations import duration
 from kerv_cli.base.errors import Interrupted, KervError, UsageError
 from kerv_cli.base.limits import description
 from kerv_cli.base.settings import CommandSettings
@@ -194,8 +194,8 @@ def made(plan: Plan[T], database: Database, show: bool = False, as_json: bool = 
     from kerv_cli.lab import runs
 
     if show:
-        time = f", {about(plan.seconds(), 'from a few steps, measured now')}" if plan.seconds else ""
-        end_with_plan(f"{plan.text}{time}", as_json)
+        time = f"about {duration(plan.seconds())}" if plan.seconds else "time unknown"
+        end_with_plan(f"{plan.text}, {time} ({plan.source})", as_json)
     with runs.making(database, plan.kind, plan.folder) as run:
         yield plan.make(lambda title: progress_bar(title, run))
 

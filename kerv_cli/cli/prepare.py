@@ -40,13 +40,17 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
         lines[step.kind] = [*step.command, *passed_on]
         rows.append((step.kind, step.state, f"kerv {shlex.join(lines[step.kind])}"))
     print_table(("what", "state", "command"), rows, name)
+    run = typer.main.get_command(app).main
     if plan:
+        for step in steps:
+            if step.state != THERE:
+                run([*lines[step.kind], "--plan"], standalone_mode=False)
         return
     for kind, line in lines.items():
         # planned again before each step: an artifact that was just made can make a later one outdated
         states = {step.kind: step.state for step in planned(settings, database)}
         if states[kind] != THERE:
             typer.echo(f"\nkerv {shlex.join(line)}")
-            if code := typer.main.get_command(app).main(line, standalone_mode=False):
+            if code := run(line, standalone_mode=False):
                 raise typer.Exit(code)
     typer.echo(f"\n{name} is ready: kerv sweep study=own policy.target={name}{results_word(overrides)}")

@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from kerv_cli.base.durations import count
 from kerv_cli.base.errors import KervError
@@ -23,7 +24,7 @@ from kerv_cli.base.paths import check_free
 from kerv_cli.base.registry import find
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.spaces import ActionSpace
-from kerv_cli.engine.decoder import Decoder
+from kerv_cli.engine.decoder import Decoder, Stopwatch
 from kerv_cli.engine.record import MEAN, MEASURES, DecodeRecord, variability
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database
@@ -36,6 +37,7 @@ from kerv_cli.methods.kerv.prediction import Noise, kalman_weights
 from kerv_cli.targets.observations import check_tail, observations_of
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_tasks, demos_for
+from kerv_cli.training.fit import FEW
 from kerv_cli.training.settings import CalibrateSettings, Plan, Stage
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
@@ -97,6 +99,22 @@ class CalibrationWork:
         notes += [] if skip else ["no skip levels: no datastore of these tasks (kerv build datastore)"]
         return self.path, calibration, notes
 
+    def seconds(self) -> float:
+        """Measure what a few demonstrations take, with two decodes if there is a drafter. Estimate the time of all."""
+        settings, chosen, target = self.settings, self.chosen[:FEW], self.artifacts.description
+        clock = Stopwatch(torch.device(self.artifacts.device))
+        _, _, paths, _ = read_windows(self.dataset, chosen, target.actions, settings.window, target.chunk, _silent)
+        fit_boundary(paths, settings.boundary_windows, _silent)
+        total = clock.stop() * len(self.chosen) / len(chosen)
+        if settings.decodes and "drafter" not in self.missing:
+            decoder, times = drafting().decoder(self.artifacts.target, self.artifacts.load), list[float]()
+            for _ in range(2):  # the first time includes compiling
+                clock = Stopwatch(torch.device(self.artifacts.device))
+                decodes = episode_decodes(decoder, self.dataset, chosen[0], 2)
+                times.append(clock.stop())
+            total += min(times) * settings.decodes * len(self.tasks) / max(1, len(decodes))
+        return total
+
     def variability(self, stage: Stage) -> dict[str, stored.Variability]:
         if not self.settings.decodes or "drafter" in self.missing:
             return {}
@@ -110,6 +128,10 @@ class CalibrationWork:
         store, settings = self.artifacts.load("datastore"), self.settings
         with stage("skip levels") as progress:
             return skip_section(store, self.tasks, settings.epsilon, settings.confidence, progress)
+
+
+def _silent(done: int, total: int) -> None:
+    pass
 
 
 def plan_calibration(settings: CalibrateSettings, database: Database) -> Plan[Calibrated]:
@@ -138,7 +160,7 @@ def plan_calibration(settings: CalibrateSettings, database: Database) -> Plan[Ca
         f"positions{without}"
     )
     work = CalibrationWork(settings, artifacts, dataset, chosen, tasks, missing, path)
-    return Plan("calibration", path, text, work, check)
+    return Plan("calibration", path, text, work, check, work.seconds)
 
 
 def drafting() -> Method:

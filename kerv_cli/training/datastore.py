@@ -21,6 +21,7 @@ from kerv_cli.base.manifests import stamped
 from kerv_cli.base.paths import check_free
 from kerv_cli.base.runtime import set_up
 from kerv_cli.base.spaces import ObservationSpace
+from kerv_cli.engine.decoder import Stopwatch
 from kerv_cli.lab.database import Database
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.heisd import datastore as stored
@@ -65,6 +66,20 @@ class DatastoreWork:
         write_folder(self.folder, lambda new: self.write(new, parts, shards, rows))
         return self.folder, stored.Datastore.open(self.folder, self.artifacts.description)
 
+    def seconds(self) -> float:
+        """Encode one demonstration, and estimate the time of all."""
+        first = next(iter(self.chosen.values()))[0]
+        episode, space, times = self.dataset.load(first), self.dataset.manifest.observation, list[float]()
+        for _ in range(2):  # the first time includes loading and compiling
+            clock = Stopwatch(torch.device(self.artifacts.device))
+            entries_of(self.artifacts.target, episode, space, self.settings.key)
+            times.append(clock.stop())
+        return min(times) * self.steps / episode.steps
+
+    @property
+    def steps(self) -> int:
+        return sum(self.dataset.episodes[index].steps for indices in self.chosen.values() for index in indices)
+
     def write(
         self, new: Path, parts: Sequence[Mapping[str, np.ndarray]], shards: dict[str, stored.Shard], rows: int
     ) -> None:
@@ -104,13 +119,12 @@ def plan_datastore(settings: BuildDatastoreSettings, database: Database) -> Plan
         chosen[task] = by_seed[: settings.episodes or None]
     work = DatastoreWork(settings, artifacts, dataset, chosen, folder)
     stored.check_seeds({task: work.seeds(task) for task in chosen}, dataset.path)
-    episodes = [dataset.episodes[index] for indices in chosen.values() for index in indices]
     text = (
-        f"{folder}: {count(len(episodes), 'demonstration')} of {count(len(chosen), 'task')}, "
-        f"{sum(episode.steps for episode in episodes)} control steps, through {artifacts.folder}, keys from "
+        f"{folder}: {count(sum(map(len, chosen.values())), 'demonstration')} of {count(len(chosen), 'task')}, "
+        f"{work.steps} control steps, through {artifacts.folder}, keys from "
         f"{' + '.join(settings.key)}"
     )
-    return Plan("datastore", folder, text, work, check)
+    return Plan("datastore", folder, text, work, check, work.seconds)
 
 
 @torch.inference_mode()

@@ -223,6 +223,10 @@ def _hash(settings: DemosSettings) -> str:
     return hash_of([hashes, {kind: asdict(part) for kind, part in settings.parts().items()}, settings.chunk, *format])
 
 
+RATES = {"metaworld": 0.42, "libero": 7.2}
+"""Seconds that one core takes for a demonstration, by environment (conf/quick.yaml, docs/libero.md)."""
+
+
 def plan_demos(settings: DemosSettings) -> Plan[tuple[Path, DemoManifest]]:
     config, actor = recording_of(settings)
     config.spec.check_installed()
@@ -239,7 +243,13 @@ def plan_demos(settings: DemosSettings) -> Plan[tuple[Path, DemoManifest]]:
 
     check()
     text = f"{count(len(config.tasks), 'task')} x {count(settings.episodes, 'episode')} -> {folder}"
-    return Plan("demos", folder, text, work, check)
+    rate, processes = RATES.get(config.spec.name), config.workers
+    if rate is None or actor is not None:
+        source = "a policy acts" if actor else f"no rate of {config.spec.name} is known"
+        return Plan("demos", folder, text, work, check, source=source)
+    seconds = rate * len(config.tasks) * settings.episodes / processes
+    source = f"{rate:g} s each, in {count(processes, 'process')}"
+    return Plan("demos", folder, text, work, check, lambda: seconds, source)
 
 
 def recording_of(settings: DemosSettings) -> tuple[DemoConfig, PolicyActs | None]:

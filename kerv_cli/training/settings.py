@@ -42,7 +42,7 @@ class Plan(Generic[T]):
         text: What would be made, for `--plan`.
         work: Function that makes the artifact, and shows its stages.
         check: Called again before the work. It refuses to replace what is there.
-        seconds: Measures how long the work takes, for `--plan`.
+        seconds: Estimates how long the work takes, for `--plan`, from what `source` says. None if unknown.
     """
 
     kind: str
@@ -51,6 +51,7 @@ class Plan(Generic[T]):
     work: Callable[[Stage], T]
     check: Callable[[], object]
     seconds: Callable[[], float] | None = None
+    source: str = "from a few steps, measured now"
 
     @property
     def folder(self) -> Path:
