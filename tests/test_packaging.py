@@ -16,6 +16,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from kerv_cli.targets import provenance
+from kerv_cli.targets.compact.program import kernels
 
 ROOT = Path(__file__).resolve().parents[1]
 STAMP = Path(".venv/.kerv-installed")
@@ -68,21 +69,37 @@ def test_the_requirements_keep_the_physics_engine_that_results_depend_on(metadat
 
 @pytest.fixture(scope="module")
 def installed(wheel, tmp_path_factory):
-    """Variables of a process that imports the wheel and keeps compiled kernels beside its code."""
+    """Variables of a process that imports the wheel. Its kernels are compiled: they are those of the checkout."""
     folder = tmp_path_factory.mktemp("installed")
     wheel.extractall(folder / "site")
+    ours, theirs = Path(str(kernels().__file__)), folder / "site/kerv_cli/targets/compact/kernels.py"
+    shutil.copytree(ours.parent / "__pycache__", theirs.parent / "__pycache__")
+    shutil.copystat(ours, theirs)  # numba compares the times
     others = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
     return others | {"PYTHONPATH": str(folder / "site"), "TMPDIR": str(folder)}
+
+
+KERNELS = """
+import numba
+
+@numba.njit("float64(float64)", cache=True)
+def run(number):
+    return number
+"""
 
 
 def test_processes_compile_once_and_say_so(installed, tmp_path):
     """Of two at once one compiles and the other waits. A third, which is given a cache folder that cannot be written,
     finds what they kept beside the code."""
+    site = tmp_path / "site"
+    shutil.copytree(installed["PYTHONPATH"], site, ignore=shutil.ignore_patterns("pretrained", "__pycache__"))
+    (site / "kerv_cli/targets/compact/kernels.py").write_text(KERNELS)  # few, to compile fast
+    own = installed | {"PYTHONPATH": str(site), "TMPDIR": str(tmp_path)}
     script = "from kerv_cli.targets.compact.program import kernels; kernels()"
     told = []
     for changes in ([{}, {}], [{"NUMBA_CACHE_DIR": "/proc/none"}]):
         processes = [
-            subprocess.Popen([sys.executable, "-c", script], cwd=tmp_path, env=installed | one, stderr=subprocess.PIPE)
+            subprocess.Popen([sys.executable, "-c", script], cwd=tmp_path, env=own | one, stderr=subprocess.PIPE)
             for one in changes
         ]
         told += [process.communicate()[1].decode() for process in processes]
