@@ -107,7 +107,6 @@ def test_runs_are_listed_and_filtered(results):
     assert listed(results, "kind=target")[0]["id"] == "target/nano-state"
     assert listed(results, "task=push") == []
     assert "did you mean method" in kerv("runs", "list", "methd=ar", f"results={results}", code=2).stderr
-    assert "step, running, interrupted, failed, 2 of 6 episodes" in kerv("runs", "list", "state=x", code=2).stderr
 
 
 def test_a_run_is_shown_and_a_wrong_name_refused(results):
@@ -236,7 +235,7 @@ def test_a_removal_that_is_killed_can_be_repeated(copy, moment):
     if name in [run["id"] for run in listed(copy)]:
         works("runs", "rm", "--yes", name, f"results={copy}")
     assert name not in [run["id"] for run in listed(copy)]
-    assert not list((copy / "rollouts").iterdir())
+    assert not list((copy / "rollouts").glob("[!.]*"))
 
 
 def test_removal_refuses_links_and_parts_of_names(copy, tmp_path):

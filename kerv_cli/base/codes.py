@@ -14,12 +14,11 @@ from typing import Any
 
 import numpy as np
 
-SCALE = 10.0
-"""Factor by which the cosine coefficients are multiplied before they are rounded (FAST §4.3)."""
+SCALE = 10.0  # factor by which the cosine coefficients are multiplied before they are rounded (FAST §4.3)
+# Number of tokens of a learnt code, the end token included. FAST has 1,024, for longer chunks with more DoFs.
 VOCABULARY = 256
-"""Number of tokens of a learnt code, the end token included. FAST has 1,024, for longer chunks with more DoFs."""
+# Unicode code point of the character for token 0. To learn or apply merges, each coefficient becomes a character.
 FIRST = 0x4E00
-"""Unicode code point of the character for token 0. To learn or apply merges, each coefficient becomes a character."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +150,6 @@ class FastCode:
         return found[: self.steps * self.dofs]
 
 
+# For each kind of tokens, the function that learns its code from chunks (n, H, D) of normalised actions. The function
+# of `bins` returns None, because every number of an action is then a token of its own.
 CODES: dict[str, Callable[[np.ndarray], FastCode | None]] = {"bins": lambda chunks: None, "fast": FastCode.learn}
-"""For each kind of tokens, the function that learns its code from chunks (n, H, D) of normalised actions. The function
-of `bins` returns None, because every number of an action is then a token of its own."""

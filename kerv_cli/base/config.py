@@ -15,34 +15,29 @@ import pickle
 import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import Field, fields, is_dataclass
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from kerv_cli.base.errors import UnknownName, UsageError, did_you_mean
 from kerv_cli.base.files import read_yaml_lines
-from kerv_cli.base.limits import check_settings, range_of
+from kerv_cli.base.limits import check_settings
 from kerv_cli.base.registry import PLUGINS, PREFILL, SETTINGS_GROUPS, Part, ProposerPart, part_of, parts
 from kerv_cli.base.settings import choices_of
 
 T = TypeVar("T")
 
+# Groups (folders) of conf/ whose files set several settings at once. A file is chosen by its name or its path.
 PRESETS = ("method", "study")
-"""Groups (folders) of conf/ whose files set several settings at once. A file is chosen by its name or its path."""
+# Groups whose files can set every key of a command, such as `train.lr`. Other files set only keys of their group.
 WHOLE = ("drafter",)
-"""Groups whose files can set every key of a command, such as `train.lr`. Other files set only keys of their group."""
-MOST_POINTS = 10_000
-"""Maximum number of combinations in a grid of settings."""
+MOST_POINTS = 10_000  # maximum number of combinations in a grid of settings
 
 
 def conf_dir() -> Path:
-    folder = os.environ.get("KERV_CONF_DIR")
     package = Path(__file__).resolve().parents[1]
-    folders = [Path(folder).resolve()] if folder else [package.parent / "conf", package / "conf"]
-    for path in folders:
-        if (path / "method").is_dir():
-            return path
-    raise UsageError(f"no configuration in {' or '.join(map(str, folders))}: set KERV_CONF_DIR to a folder like conf/")
+    checkout = package.parent / "conf"
+    return checkout if (checkout / "method").is_dir() else package / "conf"
 
 
 def groups() -> dict[str, list[str]]:
@@ -68,7 +63,7 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
     `quick=true` adds the command's settings in `conf/quick.yaml`. Typed settings take precedence over these.
     """
     from omegaconf import OmegaConf
-    from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException, ValidationError
+    from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
     typed = _typed(overrides, schema)
     if typed.get("quick"):
@@ -93,24 +88,20 @@ def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
             OmegaConf.update(nodes, key, value, merge=True)
         key, settings = "", cast(T, OmegaConf.to_object(nodes))
         _check(settings)
-    except UsageError as error:
-        if error.key not in lines:
+    except (UsageError, OmegaConfBaseException, ValueError, TypeError, RecursionError) as error:
+        if isinstance(error, UsageError) and error.key not in lines:
             raise
-        raise UsageError(f"{lines[error.key]}{error}", error.key) from error
-    except (ConfigAttributeError, ConfigKeyError) as error:
-        key = key if key in typed else str(error.full_key)
-        hint = (
-            _owner(key)
-            or did_you_mean(key, _keys(nodes))
-            or f"see 'kerv {command.replace('_', ' ')} --cfg' for the keys"
-        )
-        raise UsageError(f"{lines.get(key, '')}unknown key '{key}': {hint}", key) from error
-    except (OmegaConfBaseException, ValueError, TypeError, RecursionError) as error:
-        key = getattr(error, "full_key", None) or key
         message = str(error).partition("\n")[0]
-        if isinstance(error, ValidationError) and (at := _field(nodes, key)) is not None:
-            message += f" {range_of(at)}".rstrip()
-        raise UsageError(f"{lines.get(key, '')}{f'{key}: ' if key else ''}{message}", key) from error
+        if isinstance(error, UsageError):
+            key = error.key
+        elif isinstance(error, ConfigAttributeError | ConfigKeyError):
+            key = key if key in typed else str(error.full_key)
+            every = f"see 'kerv {command.replace('_', ' ')} --cfg' for the keys"
+            message = f"unknown key '{key}': {_owner(key) or did_you_mean(key, _keys(nodes)) or every}"
+        else:
+            key = getattr(error, "full_key", None) or key
+            message = f"{key}: {message}" if key else message
+        raise UsageError(f"{lines.get(key, '')}{message}", key) from error
     return settings
 
 
@@ -247,14 +238,6 @@ def _open_mappings(node: Any) -> None:
             OmegaConf.set_struct(child, False)
         elif isinstance(child, DictConfig):
             _open_mappings(child)
-
-
-def _field(node: Any, key: str) -> Field[Any] | None:
-    from omegaconf import OmegaConf
-
-    above, _, name = key.rpartition(".")
-    kind = OmegaConf.get_type(OmegaConf.select(node, above) if above else node)
-    return next((at for at in fields(kind) if at.name == name), None) if is_dataclass(kind) else None
 
 
 def _keys(node: Any, prefix: str = "") -> Iterator[str]:

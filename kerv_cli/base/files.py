@@ -22,8 +22,8 @@ from typing import Any
 
 from kerv_cli.base.errors import CheckpointError, StorageError, UsageError
 
+# A temporary path that nothing has changed for so long was left by a process that was killed.
 LEFT_OVER_SECONDS = 24 * 3600.0
-"""A temporary path that nothing has changed for so long was left by a process that was killed."""
 
 _OF_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.EACCES, errno.EPERM)
 
@@ -256,8 +256,8 @@ def clean(folder: Path) -> None:
                 remove(path)
 
 
+# `clean`, once per folder and process. Later calls with the same folder do nothing.
 _clean_once = functools.cache(clean)
-"""`clean`, once per folder and process. Later calls with the same folder do nothing."""
 
 
 def remove(path: Path) -> None:

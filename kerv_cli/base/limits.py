@@ -49,10 +49,6 @@ def description(at: Field[Any]) -> str:
     return ": ".join(filter(None, (" | ".join(at.metadata.get("names", ())), at.metadata.get("help", ""))))
 
 
-def range_of(at: Field[Any]) -> str:
-    return _range_text(*at.metadata["limits"]) if "limits" in at.metadata else ""
-
-
 def check_label(label: str) -> str:
     if not 0 < len(label) <= 1000 or not label.isprintable():
         raise UsageError(f"'{' '.join(label[:80].split())}' names no setting: write one line of text")

@@ -9,18 +9,18 @@ from pathlib import Path
 from kerv_cli.base.errors import StorageError, UsageError
 from kerv_cli.base.files import storage_errors, visible
 
+# Pattern of names that can be used for a folder in the results folder: no slash, no leading dot.
 PLAIN_NAME = re.compile(r"\w[\w.+-]{0,199}")
-"""Pattern of names that can be used for a folder in the results folder: no slash, no leading dot."""
 
+# Names of the shipped policies. A checkout contains all of them, the wheel only `mt10-vision`.
 RELEASED = ("libero-state", "mt10-state", "mt10-vision", "mt10-vision-parallel", "mt50-plain", "mt50-vision")
-"""Names of the shipped policies. A checkout contains all of them, the wheel only `mt10-vision`."""
 
+# Name of the file from which a training can resume, in the artifact's folder. Shipped artifacts do not have it.
 RESUME = "resume.pt"
-"""Name of the file from which a training can resume, in the artifact's folder. Shipped artifacts do not have it."""
 
 
 def results_dir(results: str) -> Path:
-    path = as_path(results)
+    path = Path(results).expanduser()
     if path.exists() and not path.is_dir():
         raise UsageError(f"results={results} is a file: name a folder")
     return path
@@ -46,7 +46,7 @@ def artifact(results: str, kind: str, name: str) -> Path:
 
 
 def artifact_or_path(results: str, kind: str, name: str) -> Path:
-    return as_path(name) if "/" in name else artifact(results, kind, name)
+    return Path(name).expanduser() if "/" in name else artifact(results, kind, name)
 
 
 def check_name(name: str, what: str) -> str:
@@ -57,12 +57,6 @@ def check_name(name: str, what: str) -> str:
             f"{what} '{name}' must be letters, digits, '_', '-', '+', '.' and begin with a letter or a digit"
         )
     return name
-
-
-def as_path(text: str) -> Path:
-    if "\0" in text or any(len(part.encode()) > 255 for part in text.split("/")) or len(text) > 4000:
-        raise UsageError(f"'{text[:80]}…' is no path")
-    return Path(text).expanduser()
 
 
 def shipped_dir() -> Path:

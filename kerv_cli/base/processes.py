@@ -11,8 +11,7 @@ import threading
 import time
 from concurrent.futures import ProcessPoolExecutor
 
-WATCH_SECONDS = 1.0
-"""Seconds between two checks whether the parent process is alive."""
+WATCH_SECONDS = 1.0  # seconds between two checks whether the parent process is alive
 
 _PR_SET_PDEATHSIG = 1
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")

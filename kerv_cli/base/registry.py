@@ -29,30 +29,30 @@ PLUGINS = "KERV_PLUGINS"
 
 _COMMANDS = "doctor rollout sweep report board view demos train prepare build calibrate runs serve work estimate bench"
 
+# For each kind, the modules that register kerv's own parts, in order. METHODS registers the parts of other kinds.
 MODULES: Mapping[str, Sequence[str]] = {
     "command": tuple(f"kerv_cli.cli.{name}" for name in _COMMANDS.split()),
     "environment": ("kerv_cli.worlds",),
     "stress": ("kerv_cli.worlds.stress",),
     "target": ("kerv_cli.targets",),
 }
-"""For each kind, the modules that register kerv's own parts, in order. METHODS registers the parts of other kinds."""
 
 METHODS = ("kerv_cli.methods",)
 
+# The kinds of parts that make up a method, in the order in which a decode uses them.
 METHOD_KINDS = ("prefill_draft", "proposer", "acceptance", "threshold", "rectifier", "boundary", "skip")
-"""The kinds of parts that make up a method, in the order in which a decode uses them."""
 
+# Groups of settings that choose a part, as in `proposer=drafter`. YAML files in conf/<group>/ are further choices.
+# `drafter` chooses what `kerv train drafter` trains.
 SETTINGS_GROUPS = (*METHOD_KINDS, "drafter")
-"""Groups of settings that choose a part, as in `proposer=drafter`. YAML files in conf/<group>/ are further choices.
-`drafter` chooses what `kerv train drafter` trains."""
 
+# Kind of cost (docs/measuring.md) of a proposer whose drafter is one decoder layer of the target's shape.
 DRAFTING = "draft"
-"""Kind of cost (docs/measuring.md) of a proposer whose drafter is one decoder layer of the target's shape."""
 
 PREFILL: Literal["prefill"] = "prefill"
+# When a proposer can draft. PREFILL: before the target's prefill. STATES: only after the prefill, because the
+# proposer reads the target's hidden states.
 STATES: Literal["states"] = "states"
-"""When a proposer can draft. PREFILL: before the target's prefill. STATES: only after the prefill, because the proposer
-reads the target's hidden states."""
 
 C = TypeVar("C")
 

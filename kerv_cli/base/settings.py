@@ -47,8 +47,8 @@ REPLACE = "replace what another command has made under this name"
 class CommandSettings:
     """Settings of every command."""
 
+    # The file that is chosen by default in each group of conf/. If two groups set the same key, the later one wins.
     groups: ClassVar[Mapping[str, str]] = {}
-    """The file that is chosen by default in each group of conf/. If two groups set the same key, the later one wins."""
 
     results: str = setting("results", "folder that kerv writes everything to")
     store: str = setting(

@@ -16,11 +16,11 @@ import numpy as np
 
 from kerv_cli.base.errors import UsageError
 
+# Largest allowed side of an image, in pixels. It limits PNG and JPEG files, and policies that read any image size.
 LARGEST = 4096
-"""Largest allowed side of an image, in pixels. It limits PNG and JPEG files, and policies that read any image size."""
 
+# A client's message as msgpack decodes it. Its values have not been checked.
 Message = Mapping[str, Any]
-"""A client's message as msgpack decodes it. Its values have not been checked."""
 
 
 def packed(value: object, text_keys: bool = False) -> bytes:

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import typer
 
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import ShowPlan, database_of, made, print_table
 from kerv_cli.training.settings import CalibrateSettings
-
-if TYPE_CHECKING:
-    from kerv_cli.methods.calibration import SkipSection
 
 
 @command(
@@ -33,25 +28,10 @@ def constants(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
         pass
     rows: list[tuple[object, ...]] = []
     for name, counts in calibration.demos.tasks.items():
-        row = calibration.variability.get(name)
-        levels = [row.decodes, f"{row.k_s:.3f}"] if row else ["-"] * 2
-        rows.append((name, counts["training"], *levels))
-    print_table(("task", "fitted on", "decodes", "K_S"), rows, f"calibration in {path}")
-    if calibration.skip is not None:
-        _print_skip(calibration.skip)
+        row, skip = calibration.variability.get(name), calibration.skip and calibration.skip.tasks.get(name)
+        levels = [row.decodes, f"{row.k_s:.3f}"] if row else [None] * 2
+        skips = [f"{skip.s_min:.4f}" if skip.share else "never", f"{skip.share:.1%}"] if skip else [None] * 2
+        rows.append((name, counts["training"], *levels, *skips))
+    print_table(("task", "fitted on", "decodes", "K_S", "s_min", "would be skipped"), rows, f"calibration in {path}")
     for line in notes:
         typer.echo(line)
-
-
-def _print_skip(skip: SkipSection) -> None:
-    rows: list[tuple[object, ...]] = []
-    for name, task in skip.tasks.items():
-        levels, figures = ("never", "-", "-"), ("-", "-")
-        if task.share:
-            levels = f"{task.s_min:.4f}", f"{task.low:.4f}", f"{task.high:.4f}"
-            figures = f"{task.within:.1%}", f"{task.error:.4f}"
-        rows.append((name, *levels, f"{task.share:.1%}", *figures, task.entries))
-    limit = f"error ≤ {skip.epsilon:g}"
-    columns = ("task", "s_min", "low", "high", "would be skipped", limit, "mean error", "entries")
-    best = f"best neighbour in another episode, {skip.confidence:.0%} with an error of at most {skip.epsilon:g}"
-    print_table(columns, rows, f"verify-skip, {best}")

@@ -174,16 +174,11 @@ class CommandWithSettings(FastFlags, TyperCommand):
             given: dict[str, Any] = {"overrides": overrides, "names": names}
             if "settings" in self.arguments:
                 given["settings"] = _settings(part, overrides, options.pop("cfg"))
-            line = [*part.name.split(), *overrides, *names]
-            for option in self.params:
-                value = options.get(option.name)
-                if value not in (None, False):
-                    line += [option.opts[0]] if value is True else [option.opts[0], str(value)]
             if options.get("plan") and isinstance(given.get("settings"), RunSettings):
                 from kerv_cli.base.runtime import device_of  # imports torch
 
                 device_of(given["settings"].runtime)
-            with noted(line):
+            with noted([*part.name.split(), *overrides, *names]):
                 part.code(**{name: given[name] for name in self.arguments}, **options)
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
@@ -207,9 +202,7 @@ class CommandWithSettings(FastFlags, TyperCommand):
 
 def _row(part: Command, key: str) -> tuple[str, str]:
     name = part.typed.get(key, key)
-    schema, *others = schemas_of(part)
-    if name.split(".")[0] not in fields_of(schema):
-        (schema,) = others
+    schema = next(one for one in schemas_of(part) if name.split(".")[0] in fields_of(one))
     value: Any = _defaults(schema)
     for word in name.split("."):
         at = fields_of(value)[word]

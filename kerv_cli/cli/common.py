@@ -252,14 +252,10 @@ def print_table(columns: Iterable[str], rows: Iterable[Iterable[object]], title:
 
     table = Table(*columns)
     for row in rows:
-        table.add_row(*map(_cell, row))
+        table.add_row(*("–" if value is None else str(value) for value in row))
     if title:
         typer.echo(title)
     console().print(table, markup=False)  # cells may name an extra in brackets
-
-
-def _cell(value: object) -> str:
-    return "–" if value is None else str(value)
 
 
 def print_rows(rows: Sequence[Mapping[str, object]], title: str | None = None) -> None:

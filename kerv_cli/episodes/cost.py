@@ -20,24 +20,22 @@ from kerv_cli.base.files import read_json
 from kerv_cli.base.registry import DRAFTING, ProposerPart
 from kerv_cli.engine.record import PARALLEL, DecodeRecord
 
+# Kinds of cost that depend on the target's size (docs/measuring.md). Every other kind, such as `retrieval`, is the
+# cost of other proposers' drafts.
 FORWARDS = ("encode", "prefill", "verify", "feed", DRAFTING, "tree")
-"""Kinds of cost that depend on the target's size (docs/measuring.md). Every other kind, such as `retrieval`, is
-the cost of other proposers' drafts."""
 
-FORMAT = 2
-"""Version of the profile's file format."""
+FORMAT = 2  # version of the profile's file format
 
+# Phases whose recorded seconds the cost model reads. For `vision`, it only reads whether the seconds are 0.
 READ_PHASES = ("vision", "propose", "accept", "rectify", "other")
-"""Phases whose recorded seconds the cost model reads. For `vision`, it only reads whether the seconds are 0."""
 
 
+# Key of a profile of the papers' public code, which goes on until it has more than N tokens: one round too many.
 EXTRA_ROUND = "extra_round"
-"""Key of a profile of the papers' public code, which goes on until it has more than N tokens: one round too many."""
 
-Columns = Mapping[str, np.ndarray]
-"""Arrays by name."""
+Columns = Mapping[str, np.ndarray]  # arrays by name
+# Attributes of `Round` that the cost model reads.
 COUNTED = ("mode", "proposer", "start", "tree_size", "accepted", "levels")
-"""Attributes of `Round` that the cost model reads."""
 
 
 def source_costs() -> dict[str, list[str]]:

@@ -19,12 +19,12 @@ from kerv_cli.episodes.settings import CHUNK
 from kerv_cli.worlds.settings import CameraSettings
 from kerv_cli.worlds.spec import World
 
+# Distance in metres. Once the fingertips were this close to the object, they count as the cause of its motion.
 AT_OBJECT = 0.05
-"""Distance in metres. Once the fingertips were this close to the object, they count as the cause of its motion."""
 
 
+# Function that takes a decode's record and returns the seconds from its observation to its first action.
 Latency = Callable[[DecodeRecord], float]
-"""Function that takes a decode's record and returns the seconds from its observation to its first action."""
 
 
 def steps_during(seconds: float, control_hz: float) -> int:

@@ -16,20 +16,17 @@ from typing import Any
 from kerv_cli.base.settings import read_settings
 from kerv_cli.episodes.settings import RolloutSettings
 
+# Version of the decoding. Increase it with every change of the code that alters tokens or actions.
+# tests/test_golden.py checks this.
+# 2: a streak compares the first source's draft on its own path, and the filter of KERV's code waits for four actions.
 ENGINE = 2
-"""Version of the decoding. Increase it with every change of the code that alters tokens or actions.
-tests/test_golden.py checks this.
 
-2: a streak compares the first source's draft on its own path, and the filter of KERV's code waits for four actions."""
+Plain = Mapping[str, Any]  # a rollout's settings as nested dictionaries, lists and plain values, as they are stored
 
-Plain = Mapping[str, Any]
-"""A rollout's settings as nested dictionaries, lists and plain values, as they are stored."""
-
+# Hashes of the weights and data that a setting uses, e.g. {"target": sha256, "drafter": sha256}.
 Identity = Mapping[str, str]
-"""Hashes of the weights and data that a setting uses, e.g. {"target": sha256, "drafter": sha256}."""
 
-OBSERVATION = "observation"
-"""Key of the identity's only entry that is not a hash: what the target observes."""
+OBSERVATION = "observation"  # key of the identity's only entry that is not a hash: what the target observes
 
 # Left out of a setting's hash: they do not change a result (folders, recording, names), or are stored separately (task
 # and seed; the policy by its hashes). All other settings are hashed.

@@ -17,8 +17,8 @@ from kerv_cli.base.wire import LARGEST, Message
 from kerv_cli.worlds.settings import WorldSettings
 from kerv_cli.worlds.spec import EnvironmentSpec
 
+# Gripper convention -> the middle of its values, and 1 if larger values open the gripper, else -1.
 OPEN = {"unit": (0.5, 1.0), "signed": (0.0, 1.0), "signed_inverted": (0.0, -1.0)}
-"""Gripper convention -> the middle of its values, and 1 if larger values open the gripper, else -1."""
 STATE = "state"
 
 

@@ -22,21 +22,16 @@ from kerv_cli.episodes.interface import Interface
 from kerv_cli.methods.settings import REMOTE, PolicySettings
 from kerv_cli.worlds.spec import EnvironmentSpec
 
-ANSWER_S = 600.0
-"""Seconds after which an answer is no longer awaited."""
-CONNECT_S = 10.0
-"""Seconds for the connection and the metadata."""
-RECONNECT_S = 120.0
-"""Seconds for which a server that was there is sought again."""
+ANSWER_S = 600.0  # seconds after which an answer is no longer awaited
+CONNECT_S = 10.0  # seconds for the connection and the metadata
+RECONNECT_S = 120.0  # seconds for which a server that was there is sought again
+# Seconds without an answer after which a line says so. The next line comes after twice as long, and so on.
 WAIT_S = 5.0
-"""Seconds without an answer after which a line says so. The next line comes after twice as long, and so on."""
-ATTEMPTS = 3
-"""How often an observation is sent if the connection ends before the answer."""
+ATTEMPTS = 3  # how often an observation is sent if the connection ends before the answer
 LARGEST_MESSAGE = 64 * 2**20
-TOO_BIG = 1009
-"""Websocket close code: a message was too large."""
+TOO_BIG = 1009  # websocket close code: a message was too large
+# How often a decoder's first observation is sent. Only the last answer counts: a server's first ones are slow.
 WARM_UP = 3
-"""How often a decoder's first observation is sent. Only the last answer counts: a server's first ones are slow."""
 
 say: Callable[[str], None] = partial(print, file=sys.stderr, flush=True)
 
@@ -208,8 +203,7 @@ def _number(value: object, default: float) -> float:
     return float(value) if is_number else default  # type: ignore[arg-type]
 
 
-_servers: dict[str, Server] = {}
-"""Settings of one server take turns on one connection: kerv's server has one seat."""
+_servers: dict[str, Server] = {}  # settings of one server take turns on one connection: kerv's server has one seat
 
 
 def server_at(url: str) -> Server:

@@ -31,8 +31,8 @@ from kerv_cli.methods.compose import Method
 from kerv_cli.methods.settings import MODEL, REMOTE
 from kerv_cli.worlds import resolve_tasks, settled
 
+# Number of seeds in a block of a rollout. It is so large that all seeds of a task usually form one block.
 MOST_SEEDS = 10_000
-"""Number of seeds in a block of a rollout. It is so large that all seeds of a task usually form one block."""
 
 
 @dataclass(frozen=True)
@@ -99,27 +99,21 @@ class ResolvedStudy:
         return found
 
 
-def resolve(
-    overrides: Sequence[str], command: str = "sweep", schema: type[SweepSettings] = SweepSettings
-) -> ResolvedStudy:
+def resolve(overrides: Sequence[str]) -> ResolvedStudy:
     """Compose all settings of the study that the command line chooses.
 
-    Args:
-        overrides: The command line's `key=value` arguments. Settings of the command, such as `study` and `results`,
-            configure the sweep. `results` and all other overrides apply to every setting of the study.
-        command: The command that runs the study, with `_` instead of a space.
-        schema: Dataclass of the command's settings.
+    Settings of `kerv sweep` configure the sweep. `results` and all other overrides apply to every setting of the study.
     """
     of_sweep, of_settings = [], []
     for override in overrides:
-        is_of_sweep = _key(override).split(".")[0] in schema.__dataclass_fields__
+        is_of_sweep = _key(override).split(".")[0] in SweepSettings.__dataclass_fields__
         if is_of_sweep:
             of_sweep.append(override)
         if not is_of_sweep or override.startswith("results="):
             of_settings.append(override)
-    sweep = compose(command, of_sweep, schema)
+    sweep = compose("sweep", of_sweep, SweepSettings)
     files = dict(override.split("=", 1) for override in of_sweep)
-    study, path = sweep.study, preset_file("study", files.get("study", schema.groups["study"]))
+    study, path = sweep.study, preset_file("study", files.get("study", SweepSettings.groups["study"]))
     study.name, typed = study.name or path.stem, set(map(_key, of_settings))
     with _line_of(path, typed, "common"):
         common = _outranked(split(study.common), of_settings)

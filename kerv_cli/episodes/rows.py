@@ -17,8 +17,8 @@ from kerv_cli.base.registry import ProposerPart
 from kerv_cli.engine.record import PHASES, DecodeRecord, Delay, EpisodeRecord, Round
 
 INT, FLOAT, TEXT, FLAG = pa.int64(), pa.float64(), pa.string(), pa.bool_()
+# Columns by name. Each has a type, and a function that reads the column's value from a record.
 Fields = dict[str, tuple[pa.DataType, Callable[..., Any]]]
-"""Columns by name. Each has a type, and a function that reads the column's value from a record."""
 
 
 def _summed(value: Callable[[DecodeRecord], Any]) -> Callable[[EpisodeRecord], Any]:
@@ -114,8 +114,8 @@ def _row(columns: Fields, record: object) -> dict[str, Any]:
     return {name: read(record) for name, (_, read) in columns.items()}
 
 
+# Columns that are computed from an episode's record. The database adds more columns, such as task and time.
 EPISODE_SCHEMA = _schema(_EPISODE)
-"""Columns that are computed from an episode's record. The database adds more columns, such as task and time."""
 
 _TOKENS = pa.list_(pa.int32())
 _OF_ROUND = {"str": TEXT, "int": pa.int32(), "tuple[int, ...]": _TOKENS}

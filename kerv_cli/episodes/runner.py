@@ -34,11 +34,10 @@ from kerv_cli.worlds.stress import NO_STRESS, Stress
 from kerv_cli.worlds.stress import build as build_stress
 
 K = TypeVar("K")
-OpenWorld = Callable[[str], World]
-"""Opens a new world for a task."""
+OpenWorld = Callable[[str], World]  # opens a new world for a task
 
+# Number of episodes that run at once in the validation of a training. With rendering, their worlds take 1.5 GB.
 TOGETHER = 16
-"""Number of episodes that run at once in the validation of a training. With rendering, their worlds take 1.5 GB."""
 
 _WORLDS = 4  # kept open per process; one with rendering takes about 90 MB
 _opened: OrderedDict[tuple[str, CameraSettings, int], World] = OrderedDict()  # the most recently used one is last
@@ -103,8 +102,8 @@ class Request(Generic[K]):
     seed: int
 
 
+# A request, with the record of its episode or the error that ended the episode.
 EpisodeEnd = tuple[Request[K], EpisodeRecord | Exception]
-"""A request, with the record of its episode or the error that ended the episode."""
 
 
 def run_together(

@@ -13,8 +13,8 @@ from kerv_cli.worlds.settings import EVALUATION_SEED, RolloutWorldSettings
 
 WAITS, REAL = "waits", "real"
 MEASURED, CONSTANT, PROFILE = "measured", "constant", "profile"
+# Value of `rollout.delay_compensation`. Actions of a new chunk that are already too old are then not executed.
 CHUNK = "chunk"
-"""Value of `rollout.delay_compensation`. Actions of a new chunk that are already too old are then not executed."""
 
 
 @dataclass
@@ -44,8 +44,7 @@ class TimingSettings:
             )
 
 
-DEFAULT_TASKS = ["MT10"]
-"""Default tasks, if the target's description names none."""
+DEFAULT_TASKS = ["MT10"]  # default tasks, if the target's description names none
 
 
 @dataclass

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from kerv_cli.base.errors import CheckpointError, UsageError
-from kerv_cli.base.paths import as_path, shipped_dir
+from kerv_cli.base.paths import shipped_dir
 from kerv_cli.episodes.cost import Profile, read_profile
 
 _SHIPPED = "-profile.json"
@@ -73,7 +73,7 @@ def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfil
     folders = (Path(results) / "bench", shipped_dir().parent / "bench")
     profiles = []
     for name in names:
-        paths = [as_path(name)]
+        paths = [Path(name).expanduser()]
         for folder in folders:
             paths += (folder / f"{name}.json", folder / f"{name}{_SHIPPED}")
         path = next(filter(Path.is_file, paths), None)

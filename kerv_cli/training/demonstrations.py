@@ -57,14 +57,13 @@ def open_demos(database: Database, names: str, tasks: Sequence[str] = (), episod
         try:
             opened.append(DemoDataset.open(folder))
         except CheckpointError as error:
-            command = command_to_go_on(database, "demos", folder)
-            if command and not (folder / "manifest.json").exists():
+            if (folder / "manifest.json").exists():
+                raise
+            if command := command_to_go_on(database, "demos", folder):
                 line = shlex.join(["kerv", *command])
                 raise CheckpointError(f"the demonstrations in {folder} are unfinished: run '{line}'") from error
-            if folder.is_dir():
-                raise
             remedy = _remedy(database.results / "artifacts/demos", folder, tasks, episodes)
-            raise CheckpointError(f"no demonstrations in {folder}: {remedy}") from error
+            raise CheckpointError(f"no complete demonstrations in {folder}: {remedy}") from error
     return DemoDataset.joined(opened)
 
 

@@ -27,14 +27,6 @@ from kerv_cli.worlds.views import views_of
 # scripted controller of one task: from an observation to an action (D,) within the limits, without memory
 Expert: TypeAlias = Callable[[Observation], NDArray[np.float64]]
 
-# by the entry of `StressPart.requires` that an environment lacks
-_LACKS = {
-    "position": "its actions have no group 'position'",
-    "model": "its world has no MuJoCo model",
-    "images": "its world draws no images",
-    "actions": "its world takes no changed actions",
-}
-
 
 @dataclass(frozen=True)
 class Seeds:
@@ -173,7 +165,7 @@ class EnvironmentSpec:
         offered |= {"position"} & {group.name for group in self.actions.groups}
         for need in StressPart.find(settings.kind).requires:
             if need not in offered:
-                why = _LACKS[need] if self.world_class else "it is a recording"
+                why = f"its worlds have no {need}" if self.world_class else "it is a recording"
                 raise UsageError(f"world.stress.kind={settings.kind}: not possible in {self.name}: {why}")
 
     def standstill(self, opening: float) -> NDArray[np.float64]:

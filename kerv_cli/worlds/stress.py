@@ -5,7 +5,6 @@ Kinds of stress change the model (light), actions (push) or images (sensor).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
@@ -21,7 +20,6 @@ from kerv_cli.worlds.vectors import unit_vector
 
 if TYPE_CHECKING:
     import mujoco
-    from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 Model: TypeAlias = "mujoco.MjModel"
@@ -122,6 +120,8 @@ class Light(Stress):
     levels = ((1.1, 10), (1.2, 15), (1.3, 20), (1.8, 45))
 
     def change(self, model: Model, changes: ModelChanges) -> None:
+        from scipy.spatial.transform import Rotation
+
         gain, degrees = self.amount
         random, head = self.generator(), model.vis.headlight
         lights = (model.light_ambient, model.light_diffuse, model.light_specular)
@@ -131,35 +131,12 @@ class Light(Stress):
         for strength in strengths:
             strength[...] *= gain
         for lamp in range(model.nlight):
-            turn = _random_turn(random, degrees).as_matrix()
+            turn = Rotation.from_rotvec(unit_vector(random, 3) * np.deg2rad(degrees)).as_matrix()
             for vector in (model.light_dir[lamp], model.light_pos[lamp]):
                 vector[:] = sum((turn * vector).T)  # not `turn @ vector`: OpenBLAS rounds differently on different CPUs
 
 
-def _random_turn(random: np.random.Generator, degrees: float) -> Rotation:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_rotvec(unit_vector(random, 3) * np.deg2rad(degrees))
-
-
 PUSH_SECONDS = 0.1
-
-
-def bursts(
-    random: np.random.Generator, per_second: float, seconds: float, control_hz: float
-) -> Iterator[tuple[bool, bool]]:
-    """Yield two booleans for each control step: whether a burst is running, and whether it begins in this step.
-
-    Args:
-        per_second: Mean number of bursts that begin per second while no burst is running.
-        seconds: Duration of a burst.
-    """
-    left = 0
-    while True:
-        begins = left == 0 and bool(random.random() < min(1.0, per_second / control_hz))
-        left = max(1, round(seconds * control_hz)) if begins else left
-        yield left > 0, begins
-        left = max(left - 1, 0)
 
 
 @StressPart("push", requires=("actions", "position"))
@@ -174,18 +151,17 @@ class Push(Stress):
 
     def begin(self, task: str, seed: int, space: ActionSpace) -> None:
         super().begin(task, seed, space)
-        self._random = self.generator()
-        self._bursts = bursts(self._random, self.amount, PUSH_SECONDS, space.control_hz)
+        self._random, self._left, self._hz = self.generator(), 0, space.control_hz
         self._position = space.dofs_of("position")
         self._half, self._middle = space.half[self._position], space.middle[self._position]
-        self._push = self._middle
 
     def act(self, action: Array, step: int) -> Array:
-        runs, begins = next(self._bursts)
-        if begins:
+        if not self._left and self._random.random() < min(1.0, self.amount / self._hz):
+            self._left = max(1, round(PUSH_SECONDS * self._hz))
             self._push = self._middle + unit_vector(self._random, len(self._half)) * self._half
-        if not runs:
+        if not self._left:
             return action
+        self._left -= 1
         executed = action.copy()
         executed[self._position] = self._push
         return executed

@@ -13,7 +13,7 @@ from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import read_mapping, sha256_of
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
-from kerv_cli.worlds import EnvironmentPart, Task, stands_for_tasks
+from kerv_cli.worlds import EnvironmentPart, Task
 from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames, load_episode, save_episode
 from kerv_cli.worlds.spec import EnvironmentSpec
 
@@ -176,10 +176,7 @@ class DemoDataset:
         """Open a dataset, and check that all files exist and have their full size. `load` checks their contents."""
         file = path / "manifest.json"
         if not file.exists():
-            command = f"'kerv demos {'task' if stands_for_tasks(path.name) else 'name'}={path.name}'"
-            if (path / "recording.json").exists():
-                raise CheckpointError(f"the demonstrations in {path} are unfinished: run {command} again to continue")
-            raise CheckpointError(f"no demonstrations in {path}: record them with {command}")
+            raise CheckpointError(f"{file} is missing: the recording of these demonstrations is unfinished")
         value = read_mapping(file)
         if value.get("format") != FORMAT:
             raise CheckpointError(f"{file} has format {value.get('format')}, this kerv reads {FORMAT}")

@@ -26,7 +26,6 @@ from PIL import Image
 
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.base.files import read_mapping, write_folder, write_json
-from kerv_cli.base.paths import as_path
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, action_limits
 from kerv_cli.worlds import EnvironmentPart
 from kerv_cli.worlds.demos.dataset import FORMAT, DemoDataset, EpisodeEntry, OnProgress, check_recorded, totals
@@ -134,7 +133,7 @@ class Source:
 def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProgress) -> DemoDataset:
     if folder.exists():
         raise UsageError(f"{folder} exists: give the new demonstrations another name")
-    path = as_path(settings.source)
+    path = Path(settings.source).expanduser()
     try:
         source = Source.open(path, settings.camera)
         write_folder(folder, lambda new: _import(source, settings, new, progress))

@@ -21,7 +21,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,20 +86,11 @@ class DemoConfig:
         return spec_of(self.tasks[0])
 
 
-class Actor(Protocol):
-    """Moves the robot during a recording instead of the expert."""
-
-    def reset(self, world: World, seed: int) -> None:
-        """Begin an episode, after the world was reset."""
-
-    def act(self, label: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the action (D,) to execute now. `label` (D,) is the expert's action in this state."""
+# makes what moves the robot instead of the expert, a `PolicyActor`; called in the process that records: picklable
+MakeActor = Callable[[DemoConfig], Any]
 
 
-MakeActor = Callable[[DemoConfig], Actor]  # called in the process that records, so it must be picklable
-
-
-def run_expert(world: World, seed: int, config: DemoConfig, actor: Actor | None) -> DemoEpisode | None:
+def run_expert(world: World, seed: int, config: DemoConfig, actor: Any) -> DemoEpisode | None:
     """Run one episode and label every state with the expert's action.
 
     Returns:
