@@ -12,7 +12,6 @@ from studies_synthetic import swept, threshold_study
 
 import kerv_cli as kerv
 from kerv_cli.base.config import as_overrides
-from kerv_cli.lab.command import STORE
 
 pytestmark = pytest.mark.usefixtures("quick_report")
 
@@ -82,25 +81,16 @@ def test_a_study_is_run_once_reported_and_loaded(study, mine):
     assert {"both.csv", "both_per_task.csv", "report.html"} <= files
 
 
-def test_a_study_stays_in_the_database_that_was_named(tmp_path, monkeypatch):
-    results, store = tmp_path / "results", f"sqlite:///{tmp_path}/other.db"
-    with monkeypatch.context() as patch:
-        patch.setenv(STORE, store)
-        swept(results, threshold_study(["reach-v3"]))
-    loaded = kerv.load_study("threshold", results=results, store=store)
-    assert "report.html" in {file.name for file in loaded.report()}
-    assert loaded.to_pandas()["episodes"].tolist() == [4] * 4
-    assert not list(results.glob("*.db"))
-
-
 def test_a_sweep_reports_from_the_database_that_was_named(mine, tmp_path):
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     path, results = mine["results"].parent / "both.yaml", tmp_path / "results"
     path.write_text("settings: {ar: method=ar, hold: method=spec_vla proposer=hold}\n", encoding="utf-8")
-    made = kerv.sweep(path, **{**mine, "results": results, "store": f"sqlite:///{elsewhere}/other.db"})
-    assert "report.html" in {file.name for file in made.report()}
-    assert made.to_pandas()["episodes"].tolist() == [1, 1]
+    store = f"sqlite:///{elsewhere}/other.db"
+    kerv.sweep(path, **{**mine, "results": results, "store": store})
+    loaded = kerv.load_study("both", results=results, store=store)
+    assert "report.html" in {file.name for file in loaded.report()}
+    assert loaded.to_pandas()["episodes"].tolist() == [1, 1]
     assert not list(results.glob("*.db"))
 
 

@@ -25,25 +25,34 @@ from kerv_cli.cli.common import one_line_errors
 pytestmark = pytest.mark.usefixtures("quick_report")
 
 INVOKE = "from typer.testing import CliRunner; from kerv_cli.cli.app import app; CliRunner().invoke(app, "
-FAST = ["episodes=2", "world.horizon=8", "record=0"]
+FAST = ["world.horizon=8", "record=0"]
 
 
-@pytest.mark.parametrize(
-    ("code", "heavy"),
-    [
-        ("import kerv_cli", "torch numpy pandas mujoco typer"),
-        ("import kerv_cli.cli.app", "torch mujoco hydra pandas rerun"),
-        ("import kerv_cli.board.app, kerv_cli.report.report", "rerun"),
-        ("from kerv_cli.base.registry import parts; parts('proposer')", "torch mujoco numpy pyarrow hydra pydantic"),
-        ("from kerv_cli.worlds import task_names; task_names()", "torch mujoco metaworld hydra pydantic"),
-        (f"{INVOKE}['train', 'drafter', '--help'])", "torch numpy hydra pydantic"),
-        (f"{INVOKE}['rollout', 'nonsense.key=1'])", "torch numpy pydantic"),
-        (f"{INVOKE}['sweep', 'study=demo', 'nonsense.key=1'])", "torch numpy pydantic"),
-    ],
-)
-def test_nothing_heavy_is_imported_before_it_is_needed(code, heavy):
-    run = process("-c", f"{code}; import sys; print(*({set(heavy.split())} & set(sys.modules)))", KERV_PLUGINS="")
-    assert run.stdout == "\n", run.stderr
+LOADS = f"""
+import sys
+
+def loads(heavy):
+    if found := set(heavy.split()) & set(sys.modules):
+        sys.exit(f"loaded: {{found}}")
+
+import kerv_cli
+loads("torch numpy pandas mujoco typer")
+from kerv_cli.base.registry import parts
+parts("proposer")
+loads("torch mujoco numpy pyarrow hydra pydantic")
+{INVOKE}["train", "drafter", "--help"])
+loads("torch numpy hydra pydantic")
+{INVOKE}["rollout", "nonsense.key=1"])
+{INVOKE}["sweep", "study=demo", "nonsense.key=1"])
+loads("torch numpy pydantic pandas mujoco rerun")
+import kerv_cli.board.app, kerv_cli.report.report
+loads("rerun")
+"""
+
+
+def test_nothing_heavy_is_imported_before_it_is_needed():
+    run = process("-c", LOADS, KERV_PLUGINS="")
+    assert run.returncode == 0, run.stderr
 
 
 FIRST = "doctor rollout sweep report board view"
@@ -58,30 +67,20 @@ def test_help_lists_first_what_a_newcomer_needs_then_what_makes_things():
     assert {"runs", "serve", "bench"} <= {*listed[11:]}
 
 
-COMPLETING = {"COMP_WORDS": "kerv rollout method=spec", "COMP_CWORD": "2", "_KERV_COMPLETE": "complete_bash"}
-
-
 @pytest.mark.parametrize(
-    ("words", "most", "times", "environment"),
-    [
-        (["--help"], 0.4, 6, {}),
-        (["train", "--help"], 0.4, 6, {}),
-        (["rollout", "--help"], 0.4, 9, {}),
-        ([], 0.4, 9, COMPLETING),
-        (["rollout", "thresold.r=3"], 0.6, 14, {}),
-        (["rollout", "--cfg"], 0.6, 14, {}),
-    ],
+    ("words", "most", "times"),
+    [("--help", 0.4, 6), ("rollout --help", 0.4, 9), ("rollout thresold.r=3", 0.6, 14)],
 )
-def test_help_and_mistakes_are_fast(words, most, times, environment, tmp_path):
+def test_help_and_mistakes_are_fast(words, most, times, tmp_path):
     def seconds(*command):
         """Of the processor."""
-        began, surroundings = os.times(), {**os.environ, "KERV_PLUGINS": "", **environment}
+        began, surroundings = os.times(), {**os.environ, "KERV_PLUGINS": ""}
         subprocess.run([sys.executable, *command], capture_output=True, check=False, env=surroundings, cwd=tmp_path)
         ended = os.times()
         return ended.children_user + ended.children_system - began.children_user - began.children_system
 
     run = "import sys; sys.argv[0] = 'kerv'; from kerv_cli.__main__ import main; main()"
-    asked = ("-W", "ignore", "-c", run, *words)
+    asked = ("-W", "ignore", "-c", run, *words.split())
     if seconds(*asked) > most:  # a loaded machine is judged against the import of typer alone
         typer = min(seconds("-c", "import typer") for _ in range(3))
         assert any(seconds(*asked) < max(most, times * typer) for _ in range(5))
@@ -142,19 +141,14 @@ def test_rollout_prints_figures_and_writes_a_recording(results):
 
 def test_a_sweep_resumes_with_more_episodes(results, tmp_path):
     study = tmp_path / "small.yaml"
-    study.write_text(
-        "title: Small\nbaseline: ar\naxis: threshold.r\n"
-        "settings:\n  ar: method=ar\n  spec_vla: method=spec_vla threshold.r=0,20\n"
-    )
+    study.write_text("settings:\n  ar: method=ar\n  spec_vla: method=spec_vla threshold.r=20\n")
     where = ["policy=state", "policy.target=nano-state", f"results={results}"]
     command = ["sweep", f"study={study}", "task=reach-v3", *FAST, *where]
-    plan = kerv(*command, "--plan")
-    assert "6 episodes to run, 0 reused" in plan.stdout, plan.stderr
-    first = kerv(*command)
-    assert "6 run, 0 reused, 0 failed" in first.stdout
+    assert "4 episodes to run, 0 reused" in kerv(*command, "episodes=2", "--plan").stdout
+    first = kerv(*command, "episodes=1")
+    assert "2 run, 0 reused, 0 failed" in first.stdout
     assert re.search(r"\d+ episodes in \d+\.\d min: \d+ per minute", first.stdout)
-    more = ["episodes=3" if word == "episodes=2" else word for word in command]
-    assert "3 run, 6 reused, 0 failed" in kerv(*more).stdout
+    assert "2 run, 2 reused, 0 failed" in kerv(*command, "episodes=2").stdout
 
 
 def test_typer_completes_commands():
@@ -207,7 +201,7 @@ def test_a_command_from_a_plugin_is_one_like_any_other(tmp_path, monkeypatch):
 
 
 def test_what_has_no_effect_is_said_in_one_line(policies):
-    words = ["policy=state", "policy.target=nano-state", f"results={policies}", "task=reach", *FAST]
+    words = ["policy=state", "policy.target=nano-state", f"results={policies}", "task=reach", "episodes=2", *FAST]
     run = kerv("rollout", "--plan", "method=ar", "acceptance=relaxed", *words)
     note, announcement = run.stderr.splitlines()
     assert note == "note: acceptance=relaxed has no effect: method ar drafts nothing"
@@ -283,7 +277,6 @@ FILES = {
     "radius.yaml": "settings:\n  ar: method=ar\n  a: method=spec_vla threshold.radius=3\n",
     "nested.yaml": "settings:\n  ar:\n    method: ar\n",
     "axis.yaml": "axis: threshold.rr\nsettings:\n  ar: method=ar\n  a: method=spec_vla threshold.r=3,9\n",
-    "no_axis.yaml": "axis: threshold.rr\nsettings: {ar: method=ar}",
     "twice.yaml": "settings:\n  ar: method=ar\n  ar: method=kerv\n",
     "part.yaml": "# a comment\nproposer: draftr\n",
     "hydra.yaml": "defaults:\n  - override /proposer: drafter\n",
@@ -301,12 +294,10 @@ ANSWERS = [
     ("train targt", "unknown train command 'targt': did you mean target?"),
     ("rollout --task=reach", "settings have no dashes: task=reach"),
     ("rollout --method kerv", "settings have no dashes: method=VALUE"),
-    ("rollout --paln", "No such option: --paln (Possible options: --plan)"),
     ("runs export --to", "Option '--to' requires an argument"),
     # lists, empty values
     ("rollout reach", "'reach' is not an override: write key=value"),
     ("rollout task=reach, push", "write a list without spaces, task=[reach,push]"),
-    ("rollout task=[reach", "cannot read 'task=[reach': write a list without spaces"),
     ("rollout results=~/runs", "quote the value: \"results='~/runs'\""),
     ("rollout results=", "results= is empty: write a value, or leave it out"),
     ("rollout task=", "task= is empty: name a task or a suite, or leave it out"),
@@ -318,22 +309,16 @@ ANSWERS = [
     ("rollout nonsense=3", "unknown key 'nonsense': see 'kerv rollout --cfg' for the keys"),
     ("rollout device=cuda", "unknown key 'device': did you mean runtime.device?"),
     ("rollout task=reach-v2", "unknown task or suite 'reach-v2': did you mean reach-v3"),
-    ("rollout method=AR", "unknown method 'AR': did you mean ar?"),
-    ("rollout rollout.clock=reel", "unknown rollout.clock 'reel': did you mean real?"),
-    ("runs list state=finished", "unknown state 'finished': known: complete, begun, damaged, step"),
     # values
     (
         "rollout episodes=1e400",
-        "episodes: Value 'inf' of type 'float' could not be converted to Integer from 1 to 1000000",
+        "episodes: Value 'inf' of type 'float' could not be converted to Integer",
     ),
-    ("rollout world.stress=push", "world.stress: Invalid type assigned"),
     ("rollout world.stress.level=9", "world.stress.level=9: from 0 to 4"),
     ("demos episodes=10 seed=100000", "seed 100000 is for evaluation; seeds for training are 0 to 49999"),
     ("rollout method=spec_vla boundary.f_star=0.3", "unknown key 'boundary.f_star'"),
     ("rollout -m method=spec_vla,kerv threshold.r=5", "method=kerv: unknown key 'threshold.r'"),
-    ("bench policy.target=mt10-vision", "unknown key 'policy.target': did you mean target?"),
     ("rollout episodes=3 episodes=4", "episodes is given twice"),
-    ("rollout seed=5", "seed=5 is a training seed"),
     ("rollout runtime.device=tpu", "runtime.device=tpu: known are cpu, cuda"),
     ("demos task=reach runtime.device=tpu --plan", "runtime.device=tpu: known are cpu, cuda"),
     # methods
@@ -346,7 +331,6 @@ ANSWERS = [
     ),
     ("rollout method=type.yaml", "type.yaml:2: threshold.r: Value 'wide' of type 'str'"),
     ("rollout proposer.kind=drafter", "proposer.kind=drafter: choose proposer=drafter, each has settings of its own"),
-    ("rollout method=nothing.yaml", "method=nothing.yaml cannot be read: No such file"),
     # what is not there
     ("rollout policy.target=mine", "make it with 'kerv train target name=mine'"),
     ("rollout policy.target=../../etc", "name a folder that holds target.json"),
@@ -358,7 +342,6 @@ ANSWERS = [
     ("runs rm", "name a run: 'kerv runs list' shows them"),
     # studies
     ("sweep study=typo.yaml", "typo.yaml:1: unknown key 'study.setings': did you mean study.settings"),
-    ("sweep study=no_baseline.yaml", "study 'no_baseline' has no setting 'ar', the baseline that its others are"),
     ("sweep study=no_baseline.yaml", "or name one of these by study.baseline=: "),
     ("sweep study=empty.yaml", "study 'empty' has no settings: see conf/study/demo.yaml"),
     ("sweep study=list.yaml", "study=list.yaml holds no keys: write key: value"),
@@ -367,7 +350,6 @@ ANSWERS = [
     ("sweep study=radius.yaml", "radius.yaml:3: unknown key 'threshold.radius': did you mean threshold"),
     ("sweep study=nested.yaml", "nested.yaml:1: study.settings={'ar': {'method': 'ar'}}: every element must be"),
     ("sweep study=axis.yaml", "axis.yaml:1: unknown axis 'threshold.rr': did you mean threshold.r?"),
-    ("sweep study=no_axis.yaml", "no_axis.yaml:1: unknown axis 'threshold.rr': there is none"),
     ("sweep study=twice.yaml", "twice.yaml:3: settings.ar is given twice, also in line 2"),
     ("sweep study=demo method=ar", "study 'demo' sets method itself: leave it out"),
     ("sweep threshold.r=1,2,3", "of which study? name one, study=NAME: 'kerv sweep' lists them; 'kerv rollout -m'"),
@@ -377,11 +359,8 @@ ANSWERS = [
     ("serve policy=expert", "policy=expert: it needs the simulator and cannot be served"),
     ("prepare policy=parallel", "decodes all tokens at once"),
     ("train drafter drafter=erly", "unknown drafter 'erly': did you mean early"),
-    ("train drafter drafter.kind=early", "drafter.kind=early: choose drafter=early, each has settings of its own"),
     ("bench target=vla-15m", "did you mean vla-150m"),
-    ("bench tokens=2", "tokens=2"),
     ("bench projections.mine=[1]", "GB/s and TFLOP/s"),
-    ("serve gripper=loose", "unknown gripper 'loose'"),
     ("serve port=70000", "port=70000"),
 ]
 """A line as typed -> what its answer says."""

@@ -3,7 +3,6 @@
 import hashlib
 import json
 import shutil
-import time
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from kerv_cli.base.manifests import read_file
 from kerv_cli.targets.compact.features import WordTokenizer
 from kerv_cli.targets.observations import Observations, read_observations
 from kerv_cli.targets.settings import TargetSettings
+from kerv_cli.worlds.demos import recording
 from kerv_cli.worlds.demos.dataset import DemoDataset, DemoManifest
 from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames, load_episode, save_episode
 from kerv_cli.worlds.demos.recording import DemoConfig, Perturbation, is_perturbed, record
@@ -128,11 +128,12 @@ def test_failed_seeds_are_replaced_by_the_next_ones(recorded, tmp_path):
     assert files_of(tmp_path / "short" / "failed") == tried  # a known failure is not run again
 
 
-def test_an_expert_that_never_succeeds_ends_the_recording(tmp_path):
+def test_an_expert_that_never_succeeds_ends_the_recording(tmp_path, monkeypatch):
+    monkeypatch.setattr(recording, "_EXTRA_SEEDS", 2)
     config = DemoConfig(("insert-peg",), 1, horizon=2, workers=1)  # a simulator that opens fast
     with pytest.raises(KervError, match="insert-peg"):
         record(config, tmp_path / "hopeless")
-    assert len(list((tmp_path / "hopeless" / "failed").rglob("*.json"))) == 22  # bounded: 2 x 1 + 20 seeds
+    assert len(list((tmp_path / "hopeless" / "failed").rglob("*.json"))) == 4  # bounded: 2 x 1 + 2 seeds
     assert not (tmp_path / "hopeless" / "manifest.json").exists()
 
 
@@ -219,20 +220,6 @@ def test_an_episode_is_written_image_by_image(tmp_path):
         tracemalloc.stop()
     assert np.array_equal(load_episode(tmp_path / "long").frames[59], np.roll(pixels, 59, 0))
     assert {path.name for path in tmp_path.iterdir()} == {"whole", "long"}
-
-
-def test_images_that_were_not_recorded_here_can_be_written_in_half_the_time(tmp_path):
-    random, ramp = np.random.default_rng(0), np.linspace(0, 9, 480)
-    smooth = (128 + 60 * np.sin(ramp)[:, None, None] + random.normal(0, 4, (480, 480, 1))).repeat(3, 2)
-    made = episode(tmp_path / "whole", 0, 4)
-    made = replace(made, frames=np.repeat(smooth.clip(0, 255).astype(np.uint8)[None], 4, 0))
-    seconds = []
-    for level in (6, 1):
-        began = time.process_time()
-        save_episode(tmp_path / "again", made, level)
-        seconds.append(time.process_time() - began)
-        assert np.array_equal(load_episode(tmp_path / "again").frames.pixels(), made.frames)
-    assert seconds[1] < seconds[0] / 2
 
 
 def test_pixels_are_those_that_were_written(two):

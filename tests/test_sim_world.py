@@ -20,7 +20,7 @@ from kerv_cli.worlds.settings import CameraSettings
 TASK = "window-close"
 
 
-def episode(world, seed, steps=25, draw=False):
+def episode(world, seed, steps=10, draw=False):
     """States of the expert's first steps, (steps + 1, 39)."""
     expert, observation = SPEC.expert(TASK), world.reset(seed)
     states = [observation.state]

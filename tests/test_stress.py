@@ -3,11 +3,9 @@
 import dataclasses
 import hashlib
 import json
-import math
 import os
 import subprocess
 import sys
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +13,6 @@ import numpy as np
 import pytest
 from command import kerv
 from examples.insertion import SPEC as INSERTION
-from hypothesis import given
-from hypothesis import strategies as st
 
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import UnknownName, UsageError
@@ -34,7 +30,6 @@ from kerv_cli.worlds.metaworld.spec import SPEC as METAWORLD
 from kerv_cli.worlds.mujoco_world import MujocoWorld
 from kerv_cli.worlds.settings import CameraSettings, StressSettings
 from kerv_cli.worlds.stress import Sensor
-from kerv_cli.worlds.vectors import length
 
 SEED, STEPS, SIZE = 50_006, 24, 48
 KINDS = ("push", "sensor", "light")
@@ -184,14 +179,14 @@ def test_what_an_environment_cannot_do_and_unknown_kinds_are_refused(monkeypatch
     recorded = register_recorded("tape", INSERTION.actions, INSERTION.observation, {"wipe": "wipe the table"}, "front")
     no_position = dataclasses.replace(INSERTION, actions=dataclasses.replace(INSERTION.actions, groups=renamed))
     for kind, spec, why in (
-        ("light", POINT, "MuJoCo model"),
+        ("light", POINT, "have no model"),
         ("push", recorded, "is a recording"),
-        ("push", no_position, "no group 'position'"),
+        ("push", no_position, "have no position"),
     ):
         with pytest.raises(UsageError, match=why):
             spec.check_stress(StressSettings(kind, 1))
     monkeypatch.setattr(PointWorld, "stressable", frozenset({"actions"}))
-    with pytest.raises(UsageError, match="not possible in point-mass: its world draws no images"):
+    with pytest.raises(UsageError, match="not possible in point-mass: its worlds have no images"):
         POINT.check_stress(StressSettings("sensor", 1))
     monkeypatch.undo()
     monkeypatch.setattr(Sensor, "levels", ((1.0, 0.0, 1.0),) * 2)
@@ -223,19 +218,10 @@ def test_the_command_line_stresses_and_records_it_in_every_row(tmp_path):
 SMALL = CameraSettings(size=24, supersample=1)
 
 
-@pytest.mark.bits
-@given(st.lists(st.floats(1e-100, 1e100).flatmap(lambda x: st.sampled_from([x, -x])), max_size=9))
-def test_a_length_is_rounded_once_per_number_and_for_the_root(numbers):
-    total = 0.0
-    for number in numbers:
-        total = float(Fraction(number) ** 2 + Fraction(total))
-    assert length(np.array(numbers)) == math.sqrt(total)
-
-
 def recorded_hashes(folder: Path) -> list[str]:
     """Hashes of demonstrations with noise, in two environments."""
     configs = [
-        DemoConfig((tasks,), episodes=2, camera=SMALL, frame_stride=25, workers=1, tail=5)
+        DemoConfig((tasks,), 1, first_seed=1, camera=SMALL, frame_stride=25, workers=1, tail=5)
         for tasks in ("INSERTION", "reach")
     ]
     return [record(config, folder / config.spec.name).sha256 for config in configs]
