@@ -190,10 +190,7 @@ def _parsed(override: str) -> Any:
 
 @functools.lru_cache(maxsize=256)
 def _composed(choices: tuple[tuple[str, str], ...], schema: type, conf: Path, artifacts: tuple[str, ...]) -> bytes:
-    """Return the settings with these choices, pickled: unpickling takes a fifth of the time of a deep copy.
-
-    Later (group, name) pairs override earlier ones. `artifacts` are the registered kinds, each a key of a policy.
-    """
+    """Return the settings with these choices, pickled: unpickling takes a fifth of the time of a deep copy."""
     from omegaconf import OmegaConf
 
     known, nodes = groups(), OmegaConf.structured(schema)
@@ -274,9 +271,9 @@ def split(text: str) -> list[str]:
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:
-    """Combine all values of the overrides. Return each combination as a list of overrides with one value each.
+    """Combine all values of the overrides: `threshold.r=0,3` gives two lists of overrides with one value each.
 
-    For example, `threshold.r=0,3` gives two lists. Hydra's other syntax for values works, too, such as `range(0,4)`.
+    Hydra's other syntax for values works, too, such as `range(0,4)`.
     """
     from hydra.errors import HydraException
 

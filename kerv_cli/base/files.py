@@ -83,10 +83,7 @@ def write_folder(folder: Path, fill: Callable[[Path], object]) -> None:
 
 
 def set_aside(folder: Path) -> Path:
-    """Rename a folder in one step, so that every command ignores it. Return the new, temporary path.
-
-    The caller then deletes the folder. If the process is killed before that, a later command deletes it.
-    """
+    """Rename a folder in one step, so that every command ignores it. Return the new path, which the caller deletes."""
     temporary = temporary_beside(folder)
     if folder.exists():
         with storage_errors(folder):
@@ -109,10 +106,7 @@ def _exchange(a: Path, b: Path) -> None:
 
 @contextlib.contextmanager
 def owned(path: Path, check: Callable[[], object]) -> Iterator[None]:
-    """Hold a lock of the operating system on a file or folder that the block makes.
-
-    `check` is called with the lock held. It refuses to replace what is there.
-    """
+    """Hold a lock of the operating system on a path that the block makes. `check`, called with it, may refuse."""
     with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         file = path.with_name(f".{path.name}.lock").open("a")

@@ -101,11 +101,7 @@ def _digest_of(fields: Mapping[str, Any]) -> str:
 def content_of(key: Sequence[str], chunk: int, target: str, files: Mapping[str, str]) -> str:
     """Return the SHA-256 that determines what a datastore finds (docs/formats.md).
 
-    Args:
-        key: Parts of the prompt that form the search keys.
-        chunk: H, control steps per stored chunk.
-        target: Hash of the target's weights.
-        files: Hashes of the datastore's files, by name.
+    `key` names the parts of the prompt, `target` and `files` are hashes.
     """
     text = json.dumps([key, chunk, target, sorted(files.items())])
     return hashlib.sha256(text.encode()).hexdigest()

@@ -39,12 +39,9 @@ def begin_worker(parent: int) -> None:
 
 
 class Workers(ProcessPoolExecutor):
-    """A pool of worker processes. Each is a new interpreter, because a fork could deadlock in a library with threads.
+    """A pool of `count` worker processes. Each is a new interpreter: a fork could deadlock in a library.
 
     Create the pool in a thread that lives as long as the workers; see `begin_worker`.
-
-    Args:
-        count: Number of processes.
     """
 
     def __init__(self, count: int) -> None:

@@ -40,41 +40,27 @@ def artifact_kinds() -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class RunEntry:
-    """One entry of the list that `kerv runs` shows: a study, an artifact, or an interrupted command.
+    """One entry of the list that `kerv runs` shows: a study, an artifact, or an interrupted command."""
 
-    Attributes:
-        id: Name by which commands find the entry.
-        kind: sweep, rollout, or a kind of artifact.
-        started: UTC (ISO 8601). For an artifact, the time when its newest file changed.
-        state: For example `complete`, `interrupted, 2 of 6 episodes`, `step 300 of 600`, `begun` or `damaged`.
-        methods: Decoding methods of the study's settings. For an artifact, only its kind.
-        total: Number of episodes or training steps that were planned. 0 if unknown.
-        done: Number of these that are finished.
-        left: Estimated remaining time, such as `about 3 min left`. Empty if unknown, or if the entry is not running.
-        message: Error message of the newest command that makes the entry.
-        figures: Main results of the entry by name, such as the success rate.
-        command: Command-line arguments (without `kerv`) that made the entry. Empty if unknown.
-        sha256: Hash by which other entries refer to this artifact.
-        made_from: Hashes of the artifacts that the entry was made from, by kind. If the settings of a study use several
-            of one kind, the keys of the others are `drafter of LABEL`. `init`: the target whose weights a training
-            started from.
-    """
-
-    id: str
-    kind: str
+    id: str  # name by which commands find the entry
+    kind: str  # sweep, rollout, or a kind of artifact
     folder: Path
-    started: str
-    state: str
-    methods: tuple[str, ...] = ()
+    started: str  # UTC (ISO 8601). For an artifact, the time when its newest file changed.
+    state: str  # for example `complete`, `interrupted, 2 of 6 episodes`, `step 300 of 600`, `begun` or `damaged`
+    methods: tuple[str, ...] = ()  # decoding methods of the study's settings. For an artifact, only its kind.
     tasks: tuple[str, ...] = ()
     episodes: int = 0
-    total: int = 0
-    done: int = 0
+    total: int = 0  # number of episodes or training steps that were planned. 0 if unknown.
+    done: int = 0  # number of these that are finished
+    # estimated remaining time, such as `about 3 min left`. Empty if unknown, or if the entry is not running.
     left: str = ""
-    message: str = ""
+    message: str = ""  # error message of the newest command that makes the entry
+    # main results of the entry by name, such as the success rate
     figures: dict[str, float] = field(default_factory=dict)
-    command: tuple[str, ...] = ()
-    sha256: str = ""
+    command: tuple[str, ...] = ()  # command-line arguments (without `kerv`) that made the entry. Empty if unknown.
+    sha256: str = ""  # hash by which other entries refer to this artifact
+    # hashes of the artifacts that the entry was made from, by kind. If the settings of a study use several of one
+    # kind, the keys of the others are `drafter of LABEL`. `init`: the target whose weights a training started from.
     made_from: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -138,11 +124,7 @@ def _with_command(entry: RunEntry, row: RunRow, is_finished: bool) -> RunEntry:
 
 
 def find_run(database: Database, name: str, exact: bool = False) -> RunEntry:
-    """Return one entry: by its id, a part that no other id contains, or `last` for the newest.
-
-    Args:
-        exact: Whether to accept only a whole id.
-    """
+    """Return one entry: by its id, by a part that no other id contains unless `exact`, or `last` for the newest."""
     runs = find_runs(database)
     if not runs:
         raise UsageError(f"no runs in {database.results}: make one with 'kerv rollout method=spec_vla task=reach'")
@@ -164,9 +146,7 @@ def find_run(database: Database, name: str, exact: bool = False) -> RunEntry:
 def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry]:
     """Return the entries that match every filter.
 
-    Args:
-        filters: `kind` is the exact kind. `method` and `task` are names, or patterns such as `drawer*`. `state` is the
-            beginning of a state.
+    `kind` is the exact kind, `method` and `task` are names or patterns such as `drawer*`, `state` begins a state.
     """
     for key in filters:
         if key not in _FILTERS:
@@ -295,10 +275,7 @@ def _made_from(value: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[
 
 
 def parents(run: RunEntry, runs: Sequence[RunEntry]) -> dict[str, str]:
-    """Return the names of the artifacts that an entry was made from, by kind.
-
-    A name is the id of another entry, `shipped` and the name of a policy, or the first 12 digits of a hash.
-    """
+    """Return what an entry was made from, by kind: ids of entries, `shipped` policies, or 12 digits of a hash."""
     names = {other.sha256: other.id for other in runs}
     for folder in visible(shipped_dir()):
         for kind in artifact_kinds():
@@ -323,10 +300,9 @@ def check_removable(run: RunEntry) -> None:
 
 
 def remove(run: RunEntry, database: Database) -> None:
-    """Remove an entry: its folder and its rows in the database.
+    """Remove an entry: its folder, which is first renamed, and its rows in the database.
 
-    The folder is first renamed to a temporary name, which a later command deletes. If this process is killed before the
-    rows are deleted, the entry is still listed and can be removed again.
+    If this process is killed before the rows are deleted, the entry is still listed and can be removed again.
     """
     gone = set_aside(run.folder)
     if run.has_episodes:

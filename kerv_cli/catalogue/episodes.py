@@ -22,8 +22,7 @@ LARGEST_ID = 2**31 - 1
 def outcomes(store: Study, task: str = "", seed: int | None = None) -> list[Any]:
     """Return one row for every label, task and seed of a study, in the study's order.
 
-    The columns are `label`, `task`, `seed`, `episode` (row number; None if the episode has not run), `success`,
-    `closest_approach`, `object_moved`, `failed` (whether the last attempt to run it raised an error).
+    `episode` is a row number, None if it has not run. `failed`: whether the last attempt to run it raised an error.
     """
     with store.database.reading() as connection:
         query = (
@@ -61,21 +60,15 @@ def totals(store: Study) -> list[Any]:
 
 @dataclass(frozen=True)
 class FoundEpisode:
-    """A stored episode, and the newest study that uses it.
+    """A stored episode, and the newest study that uses it."""
 
-    Attributes:
-        id: Row number of the episode.
-        row: The episode's row, by column: setting, study, task, seed, block, start time and results.
-        about: Machine and software versions that ran the episode.
-        earlier: Seeds that must run before this episode, in this order, so that it gives the same tokens again. Empty
-            unless the setting's skip rule adapts from episode to episode.
-    """
-
-    id: int
+    id: int  # row number of the episode
     store: Study
     episode: Episode
-    row: Mapping[str, Any]
-    about: Mapping[str, Any]
+    row: Mapping[str, Any]  # the episode's row, by column: setting, study, task, seed, block, start time and results
+    about: Mapping[str, Any]  # machine and software versions that ran the episode
+    # seeds that must run before this episode, in this order, so that it gives the same tokens again. Empty unless the
+    # setting's skip rule adapts from episode to episode.
     earlier: tuple[int, ...]
 
     @property

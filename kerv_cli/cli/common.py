@@ -83,20 +83,17 @@ def end_with_plan(text: str, as_json: bool = False) -> NoReturn:
 
 
 def end_at_once() -> NoReturn:
-    """End a server's process with exit code 0, even if threads still compute answers.
-
-    A normal exit of Python could crash, because it frees memory that a thread in C++ code still uses.
-    """
+    """End a server's process although threads compute: Python's own exit frees memory that C++ code still uses."""
     sys.stdout.flush()
     os._exit(0)
 
 
 @contextmanager
 def one_line_errors(words: Sequence[str]) -> Iterator[None]:
-    """Print an exception that is raised inside the block as one line, and exit with its code.
+    """Print an exception of the block as one line, and exit with its code. `words`: what follows `kerv`.
 
     The code is 2 for a command line that cannot be parsed, 130 for Ctrl-C, and 1 for what is no KervError. With
-    KERV_TRACEBACK=1 the exception is raised again. `words` are the command-line arguments after `kerv`.
+    KERV_TRACEBACK=1 the exception is raised again.
     """
     try:
         yield
@@ -158,10 +155,7 @@ def _refuse(message: str, code: int, error: BaseException | None, words: Sequenc
 
 
 def with_results(message: str, words: Iterable[str]) -> str:
-    """Add `results=` and `store=`, as the user typed them, to the commands of kerv that a message quotes.
-
-    A command that has `results=` already, or that has no such setting, is not changed.
-    """
+    """Add `results=` and `store=`, as typed, to the commands of kerv that a message quotes and that lack them."""
     from kerv_cli.base.registry import parts
 
     where = results_word(words)
@@ -187,10 +181,7 @@ def database_of(settings: CommandSettings) -> Database:
 
 @contextmanager
 def made(plan: Plan[T], database: Database, show: bool = False, as_json: bool = False) -> Iterator[T]:
-    """Do the work of a plan, and yield its result. The database stores how the command ended.
-
-    With `show`, print only what would be made and how long that takes, and end the command.
-    """
+    """Do the work of a plan, and yield its result. With `show`, print the plan and how long it takes, and end."""
     from kerv_cli.lab import runs
 
     if show:
@@ -202,16 +193,10 @@ def made(plan: Plan[T], database: Database, show: bool = False, as_json: bool = 
 
 @contextmanager
 def progress_bar(title: str, record: Run | None = None, has_estimate: bool = False) -> Iterator[Callable[..., None]]:
-    """Show a progress bar while the block runs. Lines that are printed meanwhile appear above it.
+    """Show a progress bar while the block runs. Without a terminal, print a line after each tenth of the work.
 
-    Without a terminal, print a line after each tenth of the work instead.
-
-    Args:
-        record: The command's row in the database, to which the progress is also written.
-        has_estimate: Whether the text says how much time is left. If not, the bar estimates and shows it.
-
-    Yields:
-        `advance(done, total, text="")`. Call it to move the bar and to change the text after it.
+    Yield `advance(done, total, text="")`. The progress is also written to `record`, the command's row in the database.
+    With `has_estimate` the text says how much time is left, else the bar estimates it.
     """
     on_terminal = sys.stderr.isatty()
     latest = -1

@@ -52,20 +52,14 @@ def source_costs() -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class Profile:
-    """Measured seconds of each kind of forward and draft, for several numbers of tokens.
+    """Measured seconds of each kind of forward and draft, for several numbers of tokens."""
 
-    Attributes:
-        prompt: Number of prompt tokens P.
-        phases: For each kind of cost, the pair (rows, seconds). `rows` are numbers of tokens, increasing. A forward
-            or draft over `rows[i]` tokens takes `seconds[i]`.
-        tokens: Number of tokens N in a chunk.
-        about: What was measured: target, machine, versions.
-    """
-
-    prompt: int
+    prompt: int  # number of prompt tokens P
+    # for each kind of cost, the pair (rows, seconds). `rows` are numbers of tokens, increasing. A forward or draft
+    # over `rows[i]` tokens takes `seconds[i]`.
     phases: Mapping[str, tuple[tuple[int, ...], tuple[float, ...]]]
-    tokens: int = 0
-    about: Mapping[str, Any] = field(default_factory=dict)
+    tokens: int = 0  # number of tokens N in a chunk
+    about: Mapping[str, Any] = field(default_factory=dict)  # what was measured: target, machine, versions
 
     def lacks(self, kinds: Iterable[str]) -> list[str]:
         return [kind for kind in kinds if not self.phases.get(kind, ((), ()))[0]]
@@ -74,14 +68,9 @@ class Profile:
         return float(self.times(kind, np.array([rows]))[0])
 
     def times(self, kind: str, rows: np.ndarray) -> np.ndarray:
-        """Return the seconds (n,) of n forwards or drafts of this kind.
+        """Return the seconds (n,) of n forwards or drafts of a kind, over `rows` (n,) tokens each.
 
-        Between the measured numbers of tokens, the seconds are interpolated linearly. Beyond the largest number they
-        are extrapolated linearly.
-
-        Args:
-            kind: Kind of cost, such as `verify`.
-            rows: Number of tokens that each forward or draft processes, (n,).
+        Seconds are linear between the measured numbers of tokens, and beyond the largest one.
         """
         measured, times = self.phases[kind]
         seconds: np.ndarray = np.interp(rows, measured, times)
@@ -122,37 +111,26 @@ def read_profile(path: Path) -> Profile:
 
 
 class Calls(NamedTuple):
-    """All m forwards, or all m drafts, that have one kind of cost in several decodes.
+    """All m forwards, or all m drafts, that have one kind of cost in several decodes."""
 
-    Attributes:
-        decode: (m,) index of the decode that ran each forward or draft.
-        rows: (m,) number of tokens that each forward or draft processed, not counting the prompt's tokens.
-        with_prompt: (m,) bool, whether the forward or draft also processed the prompt's tokens.
-    """
-
-    decode: np.ndarray
-    rows: np.ndarray
-    with_prompt: np.ndarray
+    decode: np.ndarray  # (m,) index of the decode that ran each forward or draft
+    rows: np.ndarray  # (m,) number of tokens that each forward or draft processed, not counting the prompt's tokens
+    with_prompt: np.ndarray  # (m,) bool, whether the forward or draft also processed the prompt's tokens
 
 
 @dataclass(frozen=True)
 class Work:
-    """What several decodes computed: forwards and drafts, and the recorded seconds of everything else.
+    """What several decodes computed: forwards and drafts, and the recorded seconds of everything else."""
 
-    Attributes:
-        calls: The forwards and the drafter's drafts, by kind of cost (one of `FORWARDS`).
-        sources: For each kind of cost that other proposers' drafts have, such as `retrieval`: (decodes,) bool, whether
-            the decode used a proposer with this kind of cost.
-        host: (decodes,) recorded seconds that neither depend on the target's size nor were spent on drafting.
-        propose: (decodes,) recorded seconds of drafting. 0 if the drafter drafted, because `calls` holds its drafts.
-        again: Each decode's first verification after its prefill, with its draft: the round that the papers' public
-            code runs once more at the end (`EXTRA_ROUND`).
-    """
-
-    calls: Mapping[str, Calls]
+    calls: Mapping[str, Calls]  # the forwards and the drafter's drafts, by kind of cost (one of `FORWARDS`)
+    # for each kind of cost that other proposers' drafts have, such as `retrieval`: (decodes,) bool, whether the
+    # decode used a proposer with this kind of cost
     sources: Columns
-    host: np.ndarray
+    host: np.ndarray  # (decodes,) recorded seconds that neither depend on the target's size nor were spent on drafting
+    # (decodes,) recorded seconds of drafting. 0 if the drafter drafted, because `calls` holds its drafts.
     propose: np.ndarray
+    # each decode's first verification after its prefill, with its draft: the round that the papers' public code runs
+    # once more at the end (`EXTRA_ROUND`)
     again: Mapping[str, Calls]
 
     @property
@@ -163,13 +141,8 @@ class Work:
 def work_of(rounds: Columns, counts: np.ndarray, phases: Columns, looked_up: np.ndarray, size: int) -> Work:
     """Return what several decodes computed, from the columns of their records.
 
-    Args:
-        rounds: For each name in `COUNTED`, an array (n,) with this attribute of all n rounds. The rounds of the first
-            decode come first, then those of the second decode, and so on.
-        counts: Number of rounds of each decode, (decodes,).
-        phases: For each name in `READ_PHASES`, the recorded seconds of that phase, (decodes,).
-        looked_up: Whether the decode searched the datastore, (decodes,) bool.
-        size: Number of tokens N in a chunk.
+    `rounds` has an array (n,) for each name in `COUNTED`, decode after decode, `phases` one (decodes,) for each name in
+    `READ_PHASES`. `counts` is the number of rounds of each decode, `size` the number of tokens N in a chunk.
     """
     decodes, decode = len(counts), np.repeat(np.arange(len(counts)), counts)
     mode, proposer, start = rounds["mode"], rounds["proposer"], rounds["start"]

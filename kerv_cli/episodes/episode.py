@@ -38,10 +38,7 @@ class RealClock:
     """Tells an episode how long each decode takes, and how many of the decoded actions are then too old to execute.
 
     A constant latency (seconds) must leave something to execute: in an episode of `horizon` control steps, and with
-    compensation in a chunk of `chunk` steps.
-
-    Attributes:
-        expected: Number of control steps that the next decode will probably take: as many as the last decode took.
+    compensation in a chunk of `chunk` steps. `expected` is the number of control steps that the last decode took.
     """
 
     def __init__(
@@ -71,12 +68,8 @@ class RealClock:
 def moved_after_approach(distances: Sequence[float], objects: Sequence[np.ndarray]) -> float:
     """Return the object's largest displacement, in metres, since the fingertips first came within AT_OBJECT of it.
 
-    Earlier motion is ignored, because some objects fall into place at the start. The result is 0 if the fingertips
-    never came so close to the object, and NaN if the task has no object.
-
-    Args:
-        distances: Distance between fingertips and object after each step.
-        objects: Position (3,) of the object after each step.
+    Earlier motion is ignored, because some objects fall into place at the start. 0 if the fingertips never came so
+    close, NaN if the task has no object.
     """
     if math.isnan(distances[0]):
         return math.nan
@@ -146,15 +139,8 @@ def run_episode(
 ) -> EpisodeRecord:
     """Run one episode until the task is solved or the horizon is reached, and return its record.
 
-    Simulation and rendering do not count as inference time.
-
-    Args:
-        world: The environment, opened for one task.
-        decoder: Decodes the observations.
-        seed: Seed of the initial state.
-        camera: View to record, one image per control step. None to record no images.
-        clock: Gives the latency of each decode if the world goes on during it (docs/methods.md §8). None if the world
-            waits.
+    Simulation and rendering do not count as inference time. `camera` is recorded in every control step, None records
+    nothing. `clock` gives the latency of each decode if the world goes on during it (docs/methods.md §8).
     """
     steps = episode(world, decoder, seed, camera, clock)
     decode: Any = None
@@ -177,16 +163,7 @@ def episode(
     """Run one episode like `run_episode`, but let the caller decode.
 
     The generator yields observations. Send it the record of each observation's decode. At the end it returns the
-    episode's record.
-
-    Args:
-        world: The environment, opened for one task.
-        follower: Stores the episode's past actions and positions. This is the decoder itself, or what
-            `BatchDecoder.new_episode` returned for this episode.
-        seed: Seed of the initial state.
-        camera: View to record, one image per control step. None to record no images.
-        clock: Gives the latency of each decode if the world goes on during it (docs/methods.md §8). None if the world
-            waits.
+    episode's record. `follower` is the decoder, or what `BatchDecoder.new_episode` returned for this episode.
     """
     began = time.perf_counter()
     world.reset(seed)

@@ -38,24 +38,16 @@ NOT_DETERMINING_RUNTIME = frozenset({"workers", "launch"})
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """One of the settings that a study compares: a method with all its options. It becomes a row of the study's table.
+    """One setting that a study compares: a method with all its options. It is a row of the study's table."""
 
-    Attributes:
-        label: The setting's name in the study.
-        overrides: All overrides, `key=value`, from which the setting is composed.
-        settings: The rollout's settings as nested plain values, without the task.
-        identity: Hashes of the weights and data that the setting reads.
-        varies: This setting's values for the keys that differ within its grid, by key. An entry of the study expands
-            into a grid of settings if an override has several values.
-        name: Name of the grid. If empty, it becomes the label.
-    """
-
-    label: str
-    overrides: tuple[str, ...]
-    settings: Plain
-    identity: Identity
+    label: str  # the setting's name in the study
+    overrides: tuple[str, ...]  # all overrides, `key=value`, from which the setting is composed
+    settings: Plain  # the rollout's settings as nested plain values, without the task
+    identity: Identity  # hashes of the weights and data that the setting reads
+    # this setting's values for the keys that differ within its grid, by key. An entry of the study expands into a
+    # grid of settings if an override has several values.
     varies: Mapping[str, Any] = field(default_factory=dict)
-    name: str = ""
+    name: str = ""  # name of the grid. If empty, it becomes the label.
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", self.name or self.label)
@@ -105,12 +97,7 @@ def hash_of(value: object) -> str:
 
 
 def work_of(settings: Plain, identity: Identity) -> str:
-    """Return the hash of what determines results, except task and seed: settings, weights and data, and ENGINE.
-
-    Args:
-        settings: The rollout's settings as nested plain values.
-        identity: Hashes of the setting's weights and data, as `policy.check` returns them.
-    """
+    """Return the hash of what determines results, except task and seed: settings, weights and data, and ENGINE."""
     policy = {"kind": settings["policy"]["kind"]}
     for name, value in without(identity, {OBSERVATION}).items():
         policy[f"{name}_sha256"] = value
@@ -122,10 +109,7 @@ def determining(settings: Plain) -> dict[str, Any]:
 
 
 def stress_of(settings: Plain) -> dict[str, Any]:
-    """Return the kind and level of a setting's stress, a disturbance of the world (docs/stress.md).
-
-    At level 0 the kind is `none`.
-    """
+    """Return the kind and level of a setting's stress (docs/stress.md). At level 0 the kind is `none`."""
     stress = settings["world"]["stress"]
     level = int(stress["level"])
     return {"kind": stress["kind"] if level else "none", "level": level}

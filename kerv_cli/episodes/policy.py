@@ -43,15 +43,10 @@ def artifacts_of(settings: MethodSettings) -> Artifacts:
 
 
 def check(settings: RolloutSettings, is_awaited: bool = False) -> dict[str, str]:
-    """Refuse settings that cannot run, before anything slow starts.
+    """Refuse settings that cannot run, before anything slow starts. Return the identity of what runs.
 
-    Args:
-        settings: The settings.
-        is_awaited: Whether to wait two minutes for a server that does not answer.
-
-    Returns:
-        What determines the results, apart from the settings: hashes of files with weights or data, by the kind of file.
-        The key `observation` says what the policy observes, such as `vision`.
+    It has hashes of weights and data by kind, and at `observation` what the policy observes. `is_awaited`: wait two
+    minutes for a server that does not answer.
     """
     tasks = resolve_tasks(settings.task)
     spec = spec_of(tasks[0])
@@ -200,13 +195,6 @@ def warm_up(decoder: Follower, task: str, space: ObservationSpace, pixels: int, 
     """Run a few decodes before anything is timed, because the first decodes allocate memory and choose kernels.
 
     The simulated hand moves, so that parts that need past actions or positions run, too.
-
-    Args:
-        decoder: The decoder.
-        task: Name of the task.
-        space: The task's observation space.
-        pixels: Width and height of the images.
-        decodes: Number of decodes.
     """
     still = still_observation(decoder, space, pixels)
     decoder.reset(task, 0, np.array([0.0, 0.0, 0.1]))

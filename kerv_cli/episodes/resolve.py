@@ -37,18 +37,13 @@ MOST_SEEDS = 10_000
 
 @dataclass(frozen=True)
 class Point:
-    """One setting of a study, given by its overrides. Overrides with several values expand into a grid of points.
+    """One setting of a study, given by its overrides. Overrides with several values expand into a grid of points."""
 
-    Attributes:
-        name: Name of the grid. All points of a grid have the same name.
-        overrides: This point's overrides, `key=value`.
-        words: All overrides from which the setting is composed, those of the study and the command line included.
-        varies: This point's values for the keys that differ within the grid, by key.
-    """
-
-    name: str
-    overrides: tuple[str, ...]
+    name: str  # name of the grid. All points of a grid have the same name.
+    overrides: tuple[str, ...]  # this point's overrides, `key=value`
+    # this point's values for the keys that differ within the grid, by key
     varies: Mapping[str, str] = field(default_factory=dict)
+    # all overrides from which the setting is composed, those of the study and the command line included
     words: tuple[str, ...] = ()
 
     @classmethod
@@ -157,10 +152,7 @@ def _points(study: StudySettings, path: Path, typed: Collection[str]) -> dict[st
 
 @contextmanager
 def _line_of(path: Path, typed: Collection[str], place: str, others: Mapping[str, str] = {}) -> Iterator[None]:
-    """Add the study's file and line to a UsageError that is not about a `typed` key.
-
-    `place` is the key in the file, such as `settings.ar`. `others` maps settings to keys that replace it.
-    """
+    """Add the study's file and line to a UsageError, unless a `typed` key is wrong. `others` maps settings to keys."""
     try:
         yield
     except UsageError as error:
@@ -173,12 +165,8 @@ def _line_of(path: Path, typed: Collection[str], place: str, others: Mapping[str
 def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
     """Compose the settings of `kerv rollout`. With -m, compose one setting per combination of values in comma lists.
 
-    Every setting runs on all tasks. The baseline is the first autoregressive setting. If there is none, it is the first
-    setting. A label consists of the method's name, the parts that replace the method's own, and the values that vary.
-
-    Args:
-        overrides: The command line's `key=value` arguments.
-        multirun: Whether -m was given.
+    Every setting runs on all tasks. The baseline is the first autoregressive setting, else the first one. A label is
+    the method's name, the parts that replace the method's own, and the values that vary.
     """
     tasks, others = _parted(overrides, {"task"})
     swept = swept_keys(others) if multirun else []
@@ -205,13 +193,7 @@ def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
 
 
 def repeating_words(setting: Setting, task: str, seeds: Sequence[int]) -> list[str]:
-    """Return the arguments of `kerv` that run stored episodes of one task again, and record them.
-
-    Args:
-        setting: The stored setting.
-        task: Name of the task.
-        seeds: Seeds of the episodes, which must be successive.
-    """
+    """Return the arguments of `kerv` that run stored episodes of successive seeds again, and record them."""
     if list(seeds) != list(range(seeds[0], seeds[0] + len(seeds))):
         raise UsageError("its skip rule adapts from episode to episode, and the seeds before it have gaps")
     place = [f"task={task}", f"seed={seeds[0]}", f"episodes={len(seeds)}", *(["record=-1"] if len(seeds) > 1 else [])]
@@ -253,12 +235,8 @@ def _is_ar(settings: RolloutSettings) -> bool:
 def idle_overrides(resolved: ResolvedStudy, sweep: bool = True) -> dict[str, str]:
     """Return the overrides that have no effect, each with the reason.
 
-    If the study has several settings, an override in its file is returned as `LABEL: KEY=VALUE`. An override from the
-    command line is returned only if it has no effect on any setting.
-
-    Args:
-        resolved: The study or rollout.
-        sweep: Whether `resolved` is a study, whose episodes may run in several processes.
+    An override in the file of several settings is returned as `LABEL: KEY=VALUE`. One from the command line is returned
+    only if no setting reads it.
     """
     reasons: dict[str, str] = {}
     in_each = []
@@ -285,10 +263,7 @@ def _without_effect(overrides: Iterable[str], idle: Mapping[str, str]) -> dict[s
 
 
 def idle_keys(settings: RolloutSettings) -> dict[str, str]:
-    """Return the keys of settings that have no effect in this combination, each with the reason.
-
-    For the scripted expert and a server, other settings of methods are refused.
-    """
+    """Return the keys of settings that have no effect in this combination, each with the reason."""
     if settings.policy.kind != MODEL:
         pixels = _pixels_of(settings)
         drawn = dict.fromkeys(("size", "supersample"), f"{settings.policy.interface} wants pictures of {pixels} pixels")
@@ -323,10 +298,7 @@ def idle_keys(settings: RolloutSettings) -> dict[str, str]:
 
 
 def tasks_of(settings: RolloutSettings) -> tuple[str, ...]:
-    """Return the full names of a rollout's tasks. By default they are the tasks that its target was trained on.
-
-    If the target does not name its training tasks, the default is DEFAULT_TASKS.
-    """
+    """Return the full names of a rollout's tasks, by default those of its target, else DEFAULT_TASKS."""
     return resolve_tasks(settings.task or list(trained_tasks(settings)) or DEFAULT_TASKS)
 
 

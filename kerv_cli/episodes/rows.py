@@ -26,10 +26,7 @@ def _summed(value: Callable[[DecodeRecord], Any]) -> Callable[[EpisodeRecord], A
 
 
 def _judged(value: Callable[[Round], int], *served: str) -> Callable[[EpisodeRecord], int]:
-    """Return a function that sums a value over those rounds of an episode in which a draft was verified.
-
-    `served` are the attributes of `Served` that a server sends in place of rounds.
-    """
+    """Sum a value over the rounds that verified a draft, and the attributes `served` that a server sends."""
     return _summed(
         lambda decode: (
             sum(value(one) for one in decode.rounds if one.is_verification)
@@ -47,11 +44,7 @@ def _phase(phase: str) -> Callable[[DecodeRecord], float | None]:
 
 
 def _columns(*names: str, kind: pa.DataType = INT, read: Callable[[str], Any] = attrgetter, as_: str = "{}") -> Fields:
-    """Return one column for each name, all of the type `kind`.
-
-    `read(name)` returns the function that reads the column's value from a record. `as_` is the pattern of the columns'
-    names, such as `seconds.{}`.
-    """
+    """Return a column for each name. `read(name)` reads its value from a record; `as_` is the pattern of its name."""
     return {as_.format(name): (kind, read(name)) for name in names}
 
 

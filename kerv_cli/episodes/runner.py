@@ -1,8 +1,7 @@
 """Run episodes in the worlds (open environments) of this process: one after the other, or several at once.
 
-All settings in a process share weights, datastores and worlds. Each setting has its own decoder, because a skip rule
-may depend on earlier episodes. Each setting also renders its own images, so that no setting gains from the caches of
-another.
+Settings in a process share weights, datastores and worlds. Each has its own decoder and renders its own images, so
+that none gains from another's caches.
 """
 
 from __future__ import annotations
@@ -44,13 +43,7 @@ _opened: OrderedDict[tuple[str, CameraSettings, int], World] = OrderedDict()  # 
 
 
 def open_world(task: str, settings: WorldSettings, stress: Stress = NO_STRESS) -> World:
-    """Return this process's world (an open environment) for a task. The most recently used worlds stay open.
-
-    Args:
-        task: Name of the task.
-        settings: Camera and horizon.
-        stress: Disturbance in the next episodes.
-    """
+    """Return this process's world (an open environment) for a task. The most recently used worlds stay open."""
     spec = spec_of(task)
     key = task, spec.camera(settings.camera), settings.horizon
     if key not in _opened:
@@ -113,12 +106,6 @@ def run_together(
 
     The batch has up to `batch` slots. Each slot runs one episode after another. A slot opens a world for an episode,
     and keeps this world while its task has episodes left, because opening a world takes longer than resetting it.
-
-    Args:
-        decoder: Decodes the observations of all running episodes together.
-        requests: The episodes to run.
-        batch: Maximum number of episodes that run at the same time.
-        open_world: Opens a world for a task.
     """
     waiting = list(requests)
     ended: list[EpisodeEnd[K]] = []
@@ -188,10 +175,7 @@ def is_recorded(settings: RolloutSettings, seed: int) -> bool:
 
 
 def success_of(target: Target, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:
-    """Run one episode per task and seed, and return the share of successful episodes, in [0, 1].
-
-    The target decodes as it was trained to, autoregressively or in parallel. An error in an episode is raised.
-    """
+    """Return the share of successful episodes, one per task and seed. The target decodes as it was trained to."""
     decoder = BatchDecoder(native_decoder(target))
     requests = [Request(None, task, seed) for task, seed in itertools.product(tasks, seeds)]
     outcomes = []

@@ -29,11 +29,6 @@ class TimingSettings:
     batch: int = number(1, 1, 1024, help="episodes that are decoded together; above 1, no times are measured")
 
     def check_together(self, prefix: str) -> None:
-        """Refuse settings that exclude each other.
-
-        Args:
-            prefix: Text before each setting's name in the error message: `rollout.`.
-        """
         if self.batch > 1 and self.clock == REAL:
             raise UsageError(
                 f"{prefix}batch={self.batch} with {prefix}clock=real: decodes of a batch have no times, use only one"

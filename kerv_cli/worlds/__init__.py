@@ -20,21 +20,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Task:
-    """One manipulation task.
+    """One manipulation task."""
 
-    Attributes:
-        name: Full name. No other environment has a task with this name.
-        instruction: Sentence that the policy reads.
-        difficulty: Name of the task's group. Tables of results also show averages over each group.
-        horizon: Control steps of an episode. 0 stands for the environment's.
-        expert: Whether the environment's scripted experts solve it.
-    """
-
-    name: str
-    instruction: str
-    difficulty: str
-    horizon: int = 0
-    expert: bool = True
+    name: str  # full name. No other environment has a task with this name.
+    instruction: str  # sentence that the policy reads
+    difficulty: str  # name of the task's group. Tables of results also show averages over each group.
+    horizon: int = 0  # control steps of an episode. 0 stands for the environment's.
+    expert: bool = True  # whether the environment's scripted experts solve it
 
 
 W = TypeVar("W", bound="WorldSettings")

@@ -84,10 +84,7 @@ _INSTALL = f"{'' if os.geteuid() == 0 else 'sudo '}apt-get install -y libegl1 li
 
 
 def choose_backend() -> str:
-    """Return an OpenGL backend that works here.
-
-    Call it before mujoco is imported. Worker processes inherit the choice.
-    """
+    """Return an OpenGL backend that works here. Call it before mujoco is imported. Workers inherit the choice."""
     backend, error = find_backend()
     if error:
         raise RenderingUnavailable(error)
@@ -181,12 +178,7 @@ class Camera:
 
 
 def box_average(pixels: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
-    """Return the mean of every block of factor x factor pixels, rounded to the nearest integer.
-
-    Args:
-        pixels: (factor * n, factor * m, channels) uint8.
-        factor: 1 to 16, so that the sum of a block fits into 16 bits.
-    """
+    """Return the mean of every block of factor x factor pixels (uint8), rounded to the nearest; at most 16."""
     if factor == 1:
         return pixels.copy()
     total = np.full((pixels.shape[0] // factor, pixels.shape[1] // factor, pixels.shape[2]), factor**2 // 2, np.uint16)

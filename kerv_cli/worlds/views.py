@@ -15,16 +15,11 @@ _VIEW = re.compile(r"(?P<camera>[^:@]+)(:(?P<fovy>\d{1,3}(\.\d{1,3})?))?", re.AS
 
 
 class View(NamedTuple):
-    """One of the views of an image.
+    """One of the views of an image."""
 
-    Attributes:
-        name: This view's part of the full camera name, such as `gripperPOV:75` in `corner4+gripperPOV:75`.
-        fovy: Vertical field of view in degrees. If None, the camera settings decide.
-    """
-
-    name: str
+    name: str  # this view's part of the full camera name, such as `gripperPOV:75` in `corner4+gripperPOV:75`
     camera: str
-    fovy: float | None
+    fovy: float | None  # vertical field of view in degrees. If None, the camera settings decide.
 
 
 def views_of(name: str) -> list[View]:

@@ -24,16 +24,12 @@ FORMAT = 2  # of the manifest
 
 @dataclass(frozen=True)
 class EpisodeEntry:
-    """One episode in the manifest of a dataset. `bytes` and `sha256` are of its file.
-
-    Attributes:
-        perturbed: Whether noise was added to the executed actions, or an actor moved the robot instead of the expert.
-        steps: Number of control steps, up to the success.
-    """
+    """One episode in the manifest of a dataset. `bytes` and `sha256` are of its file."""
 
     seed: int
+    # whether noise was added to the executed actions, or an actor moved the robot instead of the expert
     perturbed: bool
-    steps: int
+    steps: int  # number of control steps, up to the success
     bytes: int
     sha256: str
 
@@ -59,29 +55,22 @@ class TaskEntry:
 
 @dataclass(frozen=True)
 class DemoManifest:
-    """The manifest of a dataset: what was recorded (docs/formats.md).
-
-    Attributes:
-        config: Fields of `DemoConfig` without `workers`.
-        sha256: Hash over the hashes of all episode files.
-        versions: Versions of the packages on which physics and images depend.
-        seeds: The smallest and the largest seed, with the keys `first` and `last`.
-        missing: Number of requested episodes that could not be recorded because experts failed.
-        instructions: The instruction of each task. Only for imported data, whose tasks belong to no registered
-            environment.
-    """
+    """The manifest of a dataset: what was recorded (docs/formats.md)."""
 
     format: int
     environment: str
     actions: ActionSpace
     observation: ObservationSpace
-    config: dict[str, Any]
+    config: dict[str, Any]  # fields of `DemoConfig` without `workers`
     tasks: dict[str, TaskEntry]
-    sha256: str
+    sha256: str  # hash over the hashes of all episode files
+    # versions of the packages on which physics and images depend
     versions: dict[str, str] = field(default_factory=dict)
+    # the smallest and the largest seed, with the keys `first` and `last`
     seeds: dict[str, int] = field(default_factory=dict)
     episodes: int = 0
-    missing: int = 0
+    missing: int = 0  # number of requested episodes that could not be recorded because experts failed
+    # the instruction of each task. Only for imported data, whose tasks belong to no registered environment.
     instructions: dict[str, str] = field(default_factory=dict)
 
 
@@ -155,16 +144,13 @@ class DemoEntry(EpisodeEntry):
 
 @dataclass(frozen=True)
 class DemoDataset:
-    """A complete set of recorded demonstrations on disk.
-
-    Attributes:
-        episodes: One entry per episode, sorted by dataset if several were joined, then by task, then by seed.
-        views: If images show several views side by side, read only this number of them, from the left. If 0, read all.
-    """
+    """A complete set of recorded demonstrations on disk."""
 
     path: Path
     manifest: DemoManifest
+    # one entry per episode, sorted by dataset if several were joined, then by task, then by seed
     episodes: list[DemoEntry]
+    # if images show several views side by side, read only this number of them, from the left. If 0, read all.
     views: int = 0
 
     @property

@@ -33,29 +33,23 @@ class DemoEpisode:
     """A demonstration of T control steps, which ends with the first success.
 
     If an actor (such as a policy) moved the robot instead of the expert, the episode may end without success.
-
-    Attributes:
-        perturbed: Whether noise was added to the executed actions, or an actor moved the robot instead of the expert.
-        frames: (n, size, size x views, 3) uint8. An episode that will only be saved may have an iterator of images
-            instead.
-        frame_steps: (n,) int64. Image i was drawn before the action of control step `frame_steps[i]`.
-        states: (T, s) float32, privileged state before each action. It begins with the proprioception.
-        labels: (T + tail, D) float32, the expert's actions for D DoFs, clipped and without noise. The expert executed
-            the last `tail` actions after the episode's end. In imported data, they are copies of the last recorded
-            action.
-        executed: (T, D) float32, the actions that moved the robot.
-        initial_state: (k,) float64, the world's `initial_state`, such as the placement of object and goal.
     """
 
     task: str
     seed: int
+    # whether noise was added to the executed actions, or an actor moved the robot instead of the expert
     perturbed: bool
     steps: int
+    # (n, size, size x views, 3) uint8. An episode that will only be saved may have an iterator of images instead.
     frames: NDArray[np.uint8] | EncodedFrames
-    frame_steps: NDArray[np.int64]
+    frame_steps: NDArray[np.int64]  # (n,) int64. Image i was drawn before the action of control step `frame_steps[i]`.
+    # (T, s) float32, privileged state before each action. It begins with the proprioception.
     states: NDArray[np.float32]
+    # (T + tail, D) float32, the expert's actions for D DoFs, clipped and without noise. The expert executed the last
+    # `tail` actions after the episode's end. In imported data, they are copies of the last recorded action.
     labels: NDArray[np.float32]
-    executed: NDArray[np.float32]
+    executed: NDArray[np.float32]  # (T, D) float32, the actions that moved the robot
+    # (k,) float64, the world's `initial_state`, such as the placement of object and goal
     initial_state: NDArray[np.float64]
 
     @property
@@ -141,14 +135,10 @@ LENGTH = struct.Struct("<Q")  # a safetensors file begins with the length of its
 
 
 class EncodedFrames:
-    """Images (n, size, width, 3) uint8 that are decoded when they are used.
+    """Images (n, size, width, 3) uint8 that are decoded when they are used. A wider PNG is cut off at the right.
 
-    Attributes:
-        files: Episode files, which contain the images as PNG files.
-        spans: (n, 3) int64. For each image: index into `files`, position of the PNG's first byte, position after the
-            PNG's last byte.
-        size: Height in pixels.
-        width: Width in pixels. A wider PNG is cut off at the right.
+    `spans` (n, 3) int64 has for each image the index into `files`, and the positions of the PNG's first byte and after
+    its last.
     """
 
     def __init__(self, files: Sequence[Path], spans: NDArray[np.int64], size: int, width: int) -> None:

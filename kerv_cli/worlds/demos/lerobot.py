@@ -49,21 +49,14 @@ Row: TypeAlias = Mapping[str, Any]  # of a table, or an object of a JSON file
 
 @dataclass(frozen=True)
 class Source:
-    """A LeRobot dataset to read.
-
-    Attributes:
-        info: Contents of meta/info.json.
-        episodes: Rows of the tables in meta/episodes.
-        tasks: The instructions by `task_index`.
-        key: Name of the feature with the camera's images.
-    """
+    """A LeRobot dataset to read."""
 
     folder: Path
-    info: Row
-    episodes: Sequence[Row]
-    tasks: Mapping[int, str]
+    info: Row  # contents of meta/info.json
+    episodes: Sequence[Row]  # rows of the tables in meta/episodes
+    tasks: Mapping[int, str]  # the instructions by `task_index`
     camera: str
-    key: str
+    key: str  # name of the feature with the camera's images
 
     @classmethod
     def open(cls, folder: Path, camera: str) -> Source:

@@ -46,31 +46,21 @@ _EXTRA_SEEDS = 20  # of a task, plus one per requested episode, to replace faile
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """What to record.
-
-    Attributes:
-        episodes: Number of successful episodes per task.
-        first_seed: First seed of every task. It must be a training seed.
-        perturbed: Share of episodes that are executed with noise. `is_perturbed` chooses these episodes.
-        frame_stride: Record an image at every n-th control step.
-        tail: Number of labels to record after the success. Action chunks that begin near the end need them.
-        workers: Number of processes. The result does not depend on it.
-        horizon: Control steps within which the expert must succeed. 0 stands for the environment's default.
-        policy: Hash of the actor's method and weights. Empty if the expert moves the robot.
-        expert_share: Probability that the expert, not the actor, executes a chunk of actions.
-    """
+    """What to record."""
 
     tasks: tuple[str, ...]
-    episodes: int = field(metadata=limits(1))
-    first_seed: int = 0
+    episodes: int = field(metadata=limits(1))  # number of successful episodes per task
+    first_seed: int = 0  # first seed of every task. It must be a training seed.
+    # share of episodes that are executed with noise. `is_perturbed` chooses these episodes.
     perturbed: float = number(0.5, 0, 1)
     camera: CameraSettings = field(default_factory=CameraSettings)
-    frame_stride: int = number(1, 1)
+    frame_stride: int = number(1, 1)  # record an image at every n-th control step
+    # number of labels to record after the success. Action chunks that begin near the end need them.
     tail: int = number(8, 0)
-    workers: int = number(2, 1)
-    horizon: int = 0
-    policy: str = ""
-    expert_share: float = number(0.0, 0, 1)
+    workers: int = number(2, 1)  # number of processes. The result does not depend on it.
+    horizon: int = 0  # control steps within which the expert must succeed. 0 stands for the environment's default.
+    policy: str = ""  # hash of the actor's method and weights. Empty if the expert moves the robot.
+    expert_share: float = number(0.0, 0, 1)  # probability that the expert, not the actor, executes a chunk of actions
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "tasks", resolve_tasks(self.tasks))
@@ -91,11 +81,9 @@ MakeActor = Callable[[DemoConfig], Any]
 
 
 def run_expert(world: World, seed: int, config: DemoConfig, actor: Any) -> DemoEpisode | None:
-    """Run one episode and label every state with the expert's action.
+    """Run one episode and label every state with the expert's action. An actor's episode is always returned.
 
-    Returns:
-        The episode. None if the expert did not succeed within `config.horizon` control steps, or not early enough for
-            the simulator to run the `config.tail` steps after the success. An actor's episode is always returned.
+    None if the expert did not succeed within `config.horizon` steps, or too late for `config.tail` more.
     """
     expert = world.spec.expert(world.task)
     observation = world.reset(seed)
@@ -143,8 +131,8 @@ def record(
 ) -> DemoManifest:
     """Record demonstrations into a folder, or continue an interrupted recording.
 
-    If the expert fails for a seed, the next seed after the requested range replaces it. If too many seeds fail, the
-    dataset has fewer episodes than requested. The recorded episodes do not depend on the number of workers.
+    The next seed after the requested range replaces one for which the expert fails. If too many fail, the dataset is
+    smaller. The episodes do not depend on the number of workers.
     """
     config.spec.check_installed()
     choose_backend()
@@ -206,10 +194,7 @@ def _identity(config: DemoConfig) -> dict[str, Any]:
 
 
 def check_recording(config: DemoConfig, out: Path) -> dict[str, Any]:
-    """Refuse a folder with demonstrations of another configuration.
-
-    Return the manifest's fields that are known before the recording, as JSON values.
-    """
+    """Refuse a folder with demonstrations of another configuration. Return the manifest's fields known so far."""
 
     def flat(one: dict[str, Any]) -> dict[str, Any]:
         # Another Python or numpy may resume a recording. Another simulator version may have other physics.
