@@ -166,13 +166,6 @@ def test_what_was_made_for_another_target_is_refused(results, kind):
         files.check(FILES)
 
 
-def test_an_early_drafter_of_another_chunk_length_is_refused(results):
-    path = results / "artifacts/early/nano-state/early.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "chunk": 8}))
-    with pytest.raises(CheckpointError, match="for chunks of 8 steps, not of 4"):
-        Artifacts(str(results), PolicySettings(target="nano-state")).check(["early"])
-
-
 def test_what_was_made_from_another_artifact_is_refused_beside_this_one(whole, monkeypatch):
     files = Artifacts(str(whole), PolicySettings(target="nano-state"))
     monkeypatch.setattr(EarlyDrafter, "sources", lambda self, description: {"datastore": OTHER})

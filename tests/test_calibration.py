@@ -431,7 +431,7 @@ def test_the_skip_levels_belong_to_one_datastore(own):
 
 def test_the_command_prints_what_it_found(own):
     shown = told("calibrate", *words(own, "epsilon=1.9", "confidence=0.5"))
-    for said in ("K_S", "s_min", "would be skipped", "error ≤ 1.9", "144"):
+    for said in ("K_S", "s_min", "would be skipped"):
         assert said in shown
     shutil.rmtree(own / "artifacts/datastore")
     shown = told("calibrate", *words(own, "policy.artifacts.calibration=without"))

@@ -130,7 +130,7 @@ def test_only_what_needs_no_states_can_be_chosen_before_the_prefill():
         ("policy=expert skip=similarity", "policy=expert with skip=similarity: the expert decodes nothing"),
         ("policy=expert deviation_every=5", "deviation_every=5: the expert decodes nothing"),
         ("policy.kind=exprt", "unknown policy.kind 'exprt': did you mean expert"),
-        ("seed=7", "seed=7 is a training seed: evaluation begins at 100000"),
+        ("seed=7", "seed 7 is for training; seeds for evaluation are 100000 to"),
         ("seed=99999 episodes=2", "seed 100000 is for evaluation"),
         ("policy=state method=parallel", "decodes token by token"),
         ("policy=parallel method=ar", "use method=parallel"),

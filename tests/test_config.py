@@ -167,7 +167,6 @@ WRONG = [
     ("rollout", "policy.artifacts={drafter:[1]}", "policy.artifacts.drafter"),
     ("train_target", "train.steps=0", "train.steps=0: from 1 to"),
     ("train_target", "target.width=33", "target.width=33 must be a multiple of 2 x target.heads=6"),
-    ("sweep", "study.settings=${oc.env:HOME}", ": a list or a mapping is wanted"),
     ("calibrate", "boundary_windows=[5,2]", "boundary_windows=2: from 3 to"),
     ("rollout", "method=heisd boundary.f_star=nan", "boundary.f_star"),
     ("rollout", "method=kerv threshold.r=5", "unknown key 'threshold.r': it belongs to threshold=fixed"),

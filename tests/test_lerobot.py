@@ -178,19 +178,15 @@ def edited(results: Path, tmp_path: Path, **changes: Any) -> Path:
     ("changes", "words", "said"),
     [
         ({}, ["source="], "source=DIR"),
-        ({}, ["source=meta"], "of a LeRobot dataset of version 3"),
         ({"codebase_version": "v2.1"}, [], "python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id="),
         ({"features": {"action": {"dtype": "float32", "shape": [7]}}}, [], "no images"),
         ({}, ["camera=side"], "unknown camera 'side': known: front"),
         ({}, ["strict=[jaw]"], "unknown strict DoF 'jaw'"),
-        ({}, ["dofs=six"], "unknown dofs 'six'"),
         ({}, ["environment=kitchen"], "unknown environment 'kitchen'"),
         ({"fps": 10}, ["environment=insertion"], "20 control steps per second"),
-        ({}, ["environment=metaworld"], "unknown camera 'front'"),
         ({}, ["name=front"], "another name"),
         ({}, ["name=metaworld"], "'metaworld' is an environment of kerv"),
-        ({"data_path": "{chunk}"}, [], "is no dataset as LeRobot writes them"),
-        ({"data_path": 5}, [], "is no dataset as LeRobot writes them"),
+        ({"data_path": "{chunk}"}, [], "not as LeRobot writes it"),
     ],
 )
 def test_an_import_refuses_in_one_line(results, tmp_path, changes, words, said):
@@ -311,9 +307,7 @@ def test_a_rollout_refuses_a_target_of_other_actions(spaces):
     [
         (["train", "target", "task=drawer-close", "name=new", "target.observation=state"], "environment metaworld"),
         (["train", "drafter", TARGET], "the target"),
-        (["train", "drafter", "drafter=early", TARGET], "the target"),
         (["build", "datastore", "task=drawer-close", TARGET], "the target"),
-        (["calibrate", "task=drawer-close", TARGET], "the target"),
     ],
 )
 def test_demonstrations_of_another_environment_are_refused_at_once(spaces, command, owner):

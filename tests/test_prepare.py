@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from command import kerv, told
+from command import told
 from test_calibration import write_dataset
 
 from kerv_cli.base import files, paths
@@ -234,20 +234,6 @@ def test_a_target_whose_training_was_interrupted_is_finished_by_the_command_that
 @pytest.mark.parametrize("command", ["prepare", "build datastore", "calibrate", "train drafter", "rollout", "serve"])
 def test_a_wrong_target_is_noticed_before_anything_else(command):
     assert "no target 'min'" in told(*command.split(), "policy.target=min", code=2)
-
-
-# --- drafts of a part of the tasks
-
-
-@pytest.mark.parametrize(
-    ("words", "command"),
-    [
-        ("policy.artifacts.early=m method=early_unverified", "train drafter drafter=early policy.target=mt10-vision"),
-    ],
-)
-def test_a_missing_artifact_with_a_name_is_answered_with_the_command_that_makes_it(words, command, tmp_path):
-    run = kerv("rollout", *words.split(), f"results={tmp_path / 'results'}", code=1)
-    assert f"kerv {command} {words.split()[0]}" in run.stderr
 
 
 @pytest.mark.usefixtures("quick_training")

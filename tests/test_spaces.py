@@ -113,14 +113,11 @@ def test_a_description_is_converted_field_by_field():
     ("changes", "says"),
     [
         ({"kind": "inner"}, "kind: 'inner' is no"),
-        ({"pair": [1]}, "pair: '[1]' is no"),
         ({"pair": [True, 1.0]}, "pair.0: 'True' is no int"),
         ({"pair": [1, math.inf]}, "pair.1: inf is not finite"),
         ({"every": [{}]}, "every.0.share: field required"),
         ({"every": [{"share": 1.0, "more": 1}]}, "every.0.more: unknown field"),
-        ({"every": [{"share": 1.0, "note": 2}]}, "every.0.note: '2' is no str"),
         ({"by_name": {"a": [math.nan]}}, "by_name.a.0: nan is not finite"),
-        ({"by_name": {"a": "x"}}, "by_name.a: 'x' is no"),
         ({"count": 10}, "count=10: from 1 to 9"),
     ],
 )

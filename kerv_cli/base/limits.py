@@ -64,8 +64,6 @@ def check_settings(settings: Any, what: str = "") -> None:
     for at, element in _declared(type(settings)):  # type: ignore[arg-type]
         name, value = f"{prefix}{at.name}", getattr(settings, at.name)
         values = list(value.values()) if isinstance(value, dict) else value if isinstance(value, list) else [value]
-        if element is not None and not isinstance(value, list | dict):
-            raise UsageError(f"{name}={value}: a list or a mapping is wanted", name)
         if element is not None and not all(isinstance(x, element) for x in values):
             raise UsageError(f"{name}={value}: every element must be of type {element.__name__}", name)
         for x in values:

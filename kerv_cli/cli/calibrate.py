@@ -26,12 +26,14 @@ def constants(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
     database = database_of(settings)
     with made(plan_calibration(settings, database), database, plan) as (path, calibration, notes):
         pass
+    levels_of = calibration.skip.tasks if calibration.skip else {}
+    columns = ("task", "fitted on", "decodes", "K_S", *(("s_min", "would be skipped") if levels_of else ()))
     rows: list[tuple[object, ...]] = []
     for name, counts in calibration.demos.tasks.items():
-        row, skip = calibration.variability.get(name), calibration.skip and calibration.skip.tasks.get(name)
+        row, skip = calibration.variability.get(name), levels_of.get(name)
         levels = [row.decodes, f"{row.k_s:.3f}"] if row else [None] * 2
-        skips = [f"{skip.s_min:.4f}" if skip.share else "never", f"{skip.share:.1%}"] if skip else [None] * 2
+        skips = [f"{skip.s_min:.4f}" if skip.share else "never", f"{skip.share:.1%}"] if skip else []
         rows.append((name, counts["training"], *levels, *skips))
-    print_table(("task", "fitted on", "decodes", "K_S", "s_min", "would be skipped"), rows, f"calibration in {path}")
+    print_table(columns, rows, f"calibration in {path}")
     for line in notes:
         typer.echo(line)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Callable
+from typing import Any
 
 import typer
 
@@ -24,13 +25,9 @@ def target(settings: TrainTargetSettings, plan: ShowPlan = False, as_json: AsJso
         kerv train target name=first task=reach quick=true --plan
     """
     typer.echo(f"target {settings.name}: {settings.train.steps} steps", err=True)
-    from kerv_cli.report.plots import save_curves
     from kerv_cli.training.target import plan_target
 
-    database = database_of(settings)
-    with made(plan_target(settings, database), database, plan, as_json) as (folder, metrics):
-        curves = save_curves(folder)
-    _print(folder, metrics, curves, as_json)
+    _train(plan_target, settings, plan, as_json)
 
 
 @command(
@@ -46,16 +43,17 @@ def drafter(settings: TrainDrafterSettings, plan: ShowPlan = False, as_json: AsJ
         kerv train drafter drafter=early policy.target=mine
     """
     typer.echo(f"drafter={settings.drafter.kind} of {settings.policy.target}: {settings.train.steps} steps", err=True)
-    from kerv_cli.report.plots import save_curves
     from kerv_cli.training.drafter import plan_drafter
 
+    _train(plan_drafter, settings, plan, as_json)
+
+
+def _train(planned: Callable[..., Any], settings: Any, plan: bool, as_json: bool) -> None:
+    from kerv_cli.report.plots import save_curves
+
     database = database_of(settings)
-    with made(plan_drafter(settings, database), database, plan, as_json) as (folder, metrics):
+    with made(planned(settings, database), database, plan, as_json) as (folder, metrics):
         curves = save_curves(folder)
-    _print(folder, metrics, curves, as_json)
-
-
-def _print(folder: Path, metrics: dict[str, float], curves: Path, as_json: bool) -> None:
     if as_json:
         end_with_json({"folder": folder, "best": metrics, "curves": curves})
     print_figures("best checkpoint", metrics, folder)

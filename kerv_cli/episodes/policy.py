@@ -86,9 +86,6 @@ def check(settings: RolloutSettings, is_awaited: bool = False) -> dict[str, str]
 
 def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
     seeds = range(settings.seed, settings.seed + settings.episodes)
-    if settings.seed in spec.seeds.training:
-        first = spec.seeds.evaluation.start
-        raise UsageError(f"seed={settings.seed} is a training seed: evaluation begins at {first}")
     purpose = "selection" if settings.seed in spec.seeds.selection else "evaluation"
     spec.seeds.check(seeds, purpose, f"seed={settings.seed} episodes={settings.episodes}")
 

@@ -25,8 +25,7 @@ from kerv_cli.worlds.spec import EnvironmentSpec
 ANSWER_S = 600.0  # seconds after which an answer is no longer awaited
 CONNECT_S = 10.0  # seconds for the connection and the metadata
 RECONNECT_S = 120.0  # seconds for which a server that was there is sought again
-# Seconds without an answer after which a line says so. The next line comes after twice as long, and so on.
-WAIT_S = 5.0
+WAIT_S = 5.0  # seconds without an answer after which a line says so
 ATTEMPTS = 3  # how often an observation is sent if the connection ends before the answer
 LARGEST_MESSAGE = 64 * 2**20
 TOO_BIG = 1009  # websocket close code: a message was too large
@@ -75,13 +74,10 @@ class Server:
         except ConnectionClosed as error:
             raise Lost(f"{self.url} closed the connection{_reason(error)}") from error
         except TimeoutError as error:
-            raise Lost(
-                f"{self.url} sends nothing within {CONNECT_S:g} s: check that a policy is served there"
-            ) from error
-        except WebSocketException as error:
-            raise Lost(f"{self.url} is no policy's server ({error})") from error
-        except OSError as error:
-            raise Lost(f"{self.url} cannot be reached ({error.strerror or error}): start the server there") from error
+            raise Lost(f"{self.url} sends nothing within {CONNECT_S:g} s: serve a policy there") from error
+        except (WebSocketException, OSError) as error:
+            why = getattr(error, "strerror", None) or error
+            raise Lost(f"{self.url} cannot be reached ({why}): start the server there") from error
         if isinstance(first, str):
             raise Lost(f"{self.url} sent a text frame before its metadata: {_last_line(first)}")
         metadata = _decoded(self.url, first)
@@ -105,7 +101,7 @@ class Server:
     def reached(self, since: float, patience: float) -> Message:
         """Connect, for `patience` seconds after `since` unless that was in vain before. Return the metadata."""
         patience = 0.0 if self._given_up else patience
-        waits = _Waits(f"looking for {self.url} again", since)
+        is_said = False
         while True:
             try:
                 return self.connect()
@@ -114,7 +110,9 @@ class Server:
                     self._given_up = True
                     gone = f", for {patience:g} s" if patience else ""
                     raise Lost(f"{error}{gone}") from error
-                waits.say()
+                if not is_said:
+                    say(f"kerv: {error}; looking for it again for {patience:g} s")
+                is_said = True
                 time.sleep(min(1.0, RECONNECT_S / 10))
 
     def ask(self, message: Message) -> Message:
@@ -135,12 +133,12 @@ class Server:
         return _decoded(self.url, answer)
 
     def _received(self) -> bytes | str:
-        waits = _Waits(f"waiting for an answer of {self.url}", time.monotonic())
-        while waits.seconds < ANSWER_S:
+        for waited, seconds in ((0.0, WAIT_S), (WAIT_S, ANSWER_S - WAIT_S)):
+            if waited:
+                say(f"kerv: waiting for an answer of {self.url}, since {waited:g} s")
             with contextlib.suppress(TimeoutError):
-                frame: bytes | str = self._connection.recv(timeout=min(WAIT_S, ANSWER_S - waits.seconds))
+                frame: bytes | str = self._connection.recv(timeout=seconds)
                 return frame
-            waits.say()
         self.close()  # the answer would be taken for the next one's
         raise EpisodeError(f"{self.url} gave no answer within {ANSWER_S:g} s")
 
@@ -156,22 +154,6 @@ class Server:
         drafts, accepted = (int(_number(counts.get(f"num_{one}"), 0)) for one in ("drafts", "accepted_tokens"))
         before, self._counted = self._counted, (drafts, accepted)
         return Served(seconds, max(0, drafts - before[0]), max(0, accepted - before[1]))
-
-
-class _Waits:
-    """Says in one line how long something has been awaited: after WAIT_S, twice, four times as long and so on."""
-
-    def __init__(self, what: str, since: float) -> None:
-        self.what, self.since, self.next = what, since, WAIT_S
-
-    @property
-    def seconds(self) -> float:
-        return time.monotonic() - self.since
-
-    def say(self) -> None:
-        if self.seconds >= self.next - 0.1:
-            say(f"kerv: {self.what}, since {self.seconds:.0f} s")
-            self.next *= 2
 
 
 def _watch(connection: socket.socket) -> None:

@@ -247,7 +247,7 @@ def plan_demos(settings: DemosSettings) -> Plan[tuple[Path, DemoManifest]]:
         source = "a policy acts" if actor else f"no rate of {config.spec.name} is known"
         return Plan("demos", folder, text, work, check, source=source)
     seconds = rate * len(config.tasks) * settings.episodes / processes
-    source = f"{rate:g} s each, in {count(processes, 'process')}"
+    source = f"{rate:g} s each on one core, {processes} at once"
     return Plan("demos", folder, text, work, check, lambda: seconds, source)
 
 

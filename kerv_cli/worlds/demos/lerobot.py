@@ -42,7 +42,7 @@ IMAGES = "observation.images."
 VECTORS = (ACTION, EXECUTED, STATE, ENVIRONMENT)
 OPENVLA = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
 # PIL raises SyntaxError
-_DAMAGE = (OSError, ValueError, KeyError, TypeError, SyntaxError, Image.DecompressionBombError, pa.ArrowException)
+_DAMAGE = (OSError, ValueError, LookupError, TypeError, AttributeError, SyntaxError, pa.ArrowException)
 
 Row: TypeAlias = Mapping[str, Any]  # of a table, or an object of a JSON file
 
@@ -127,12 +127,9 @@ def import_lerobot(settings: DemosImportSettings, folder: Path, progress: OnProg
     if folder.exists():
         raise UsageError(f"{folder} exists: give the new demonstrations another name")
     path = Path(settings.source).expanduser()
-    try:
+    with _reading(path):
         source = Source.open(path, settings.camera)
         write_folder(folder, lambda new: _import(source, settings, new, progress))
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        why = " ".join(f"{type(error).__name__} {error}".split())[:120]
-        raise CheckpointError(f"{path} is no dataset as LeRobot writes them, or damaged: {why}") from error
     return DemoDataset.open(folder)
 
 
@@ -283,7 +280,7 @@ def _reading(path: Path) -> Iterator[None]:
     except _DAMAGE as error:
         name = "" if isinstance(error, OSError | ValueError) else f"{type(error).__name__} "
         why = " ".join(str(error).replace(str(path), "it").split())[:120]
-        raise CheckpointError(f"{path} is missing or damaged: {name}{why}") from error
+        raise CheckpointError(f"{path} is missing, damaged or not as LeRobot writes it: {name}{why}") from error
 
 
 def _table(path: Path, columns: Sequence[str]) -> pa.Table:
