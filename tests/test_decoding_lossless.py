@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+import itertools
+import math
 
 import numpy as np
 import pytest
@@ -22,6 +24,7 @@ from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import Target
 from kerv_cli.episodes.settings import RolloutSettings
+from kerv_cli.methods import near
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.eagle import DrafterSettings
 from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter, EagleNetwork
@@ -287,25 +290,53 @@ def test_any_target_is_decoded_losslessly(seed, actions, chunk, words, nodes, in
     chunk=st.integers(1, 4),
     coded=st.booleans(),
     executed=st.lists(st.integers(0, 4), min_size=2, max_size=6),
-    after=st.sampled_from(["jacobi", "last_action", "none"]),
+    first=st.sampled_from(["last_action", "near"]),
+    after=st.sampled_from(["jacobi", "last_action", "near", "none"]),
 )
-def test_an_episode_of_last_action_is_decoded_losslessly(seed, actions, chunk, coded, executed, after):
+def test_an_episode_of_last_action_is_decoded_losslessly(seed, actions, chunk, coded, executed, first, after):
     """Whatever was executed between two decodes: nothing, a part of the chunk, all of it, or something else."""
+    coded &= "near" not in (first, after)  # FAST tokens are no bins
     space = dataclasses.replace(actions, code=short_code(chunk, actions.dofs)) if coded else actions
     target, random = MockTarget(space, chunk, seed=seed), np.random.default_rng(seed)
-    method = Method.of(
-        compose("rollout", ["method=last_action", f"proposer={after}", "threshold.r=0"], RolloutSettings)
-    )
+    drafts = ["method=last_action", f"prefill_draft={first}", f"proposer={after}", "threshold.r=0"]
+    method = Method.of(compose("rollout", drafts, RolloutSettings))
     decoder, plain, drafted = method.decoder(target, lambda kind: None), Decoder(target), False
     decoder.reset("t", seed, np.zeros(3))
     for number, steps in enumerate(executed):
         shown = Observation(np.array([0.01 * (seed % 7 + number)]), np.zeros(0), "word word")
         record = decoder.decode(shown)
         assert record.tokens == plain.decode(shown).tokens
-        drafted |= bool(number) and record.rounds[0].proposer == "last_action"
+        drafted |= bool(number) and record.rounds[0].proposer == first
         for action in [*record.actions, random.uniform(-1, 1, space.dofs)][:steps]:
             decoder.observe(action, np.zeros(3))
     assert drafted or space.longest(chunk) == 1
+
+
+def test_near_drafts_the_most_probable_beginnings():
+    """Against every prefix of three tokens, judged one by one."""
+    random = np.random.default_rng(3)
+    table, weights = random.uniform(0, 1, (2, 3, 6)) ** 4, np.array([0.3, 0.7])
+    table /= table.sum(2, keepdims=True) * 1.001
+    tokens, parents = near.likely_tree(table, weights, 20)
+    prefixes = [tokens[:0]] * len(tokens)
+    for node, parent in enumerate(parents):
+        prefixes[node] = [*(prefixes[parent] if parent >= 0 else []), tokens[node]]
+
+    def probability(prefix):
+        return sum(w * math.prod(table[g, place, t] for place, t in enumerate(prefix)) for g, w in enumerate(weights))
+
+    every = [list(prefix) for size in (1, 2, 3) for prefix in itertools.product(range(6), repeat=size)]
+    assert sorted(prefixes) == sorted(sorted(every, key=probability)[-20:])
+
+
+def test_near_expects_a_line_to_go_on_and_widens_with_its_errors():
+    line, noise = np.arange(8)[:, None] * 3, np.array([0, 4, -3, 5, 0, -4, 3, 0])[:, None]
+    guesses, scales, trust = near.expected(line, 2)
+    assert guesses[:, :, 0].tolist() == [[21, 21], [24, 27]]
+    assert trust[1] > 0.9
+    assert scales[1, 0] < 0.3 < scales[0].min()
+    assert near.expected(line + noise, 1)[1][1] > 2 * scales[1, 0]
+    assert near.expected(line[:1], 2)[2].tolist() == [0.5, 0.5]
 
 
 def test_last_action_drafts_the_rest_of_the_last_chunk_then_its_last_action():

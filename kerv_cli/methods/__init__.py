@@ -8,6 +8,7 @@
     unverified                  tokens without verification: OpenVLA-OFT's parallel pass, drafts, streaks
     heisd                       HeiSD: retrieved drafts, a boundary between two drafters, skipped verification
     reuse                       Jacobi decoding as in PD-VLA, prompt lookup, and the last action as a draft
+    near                        ours: the tokens around the last action and a line through the last two, as a tree
     merged                      ours: several drafts in one tree, before the prefill (`method=one_pass`)
     motion                      ours: accept FAST tokens, and stop decoding, by the motion that the tokens stand for
 
@@ -20,4 +21,4 @@ from __future__ import annotations
 # importing a family registers its parts; this is their order in error messages and help texts
 # isort: off
 from kerv_cli.methods import ar, spec_vla, eagle, early, calibrated, kerv, unverified, heisd, reuse  # noqa: F401
-from kerv_cli.methods import merged, motion  # noqa: F401
+from kerv_cli.methods import merged, motion, near  # noqa: F401
