@@ -24,7 +24,6 @@ class Task:
 
     name: str  # full name. No other environment has a task with this name.
     instruction: str  # sentence that the policy reads
-    difficulty: str  # name of the task's group. Tables of results also show averages over each group.
     horizon: int = 0  # control steps of an episode. 0 stands for the environment's.
     expert: bool = True  # whether the environment's scripted experts solve it
 

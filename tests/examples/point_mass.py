@@ -28,7 +28,7 @@ SPEC = EnvironmentSpec(
     observation=ObservationSpace(
         proprioception=("x", "y", "z"), state=6, places=(Place("goal", 3),), centre=(0.0, 0.0, 0.0)
     ),
-    tasks={"push-point": Task("push-point", "push the point to the goal", "easy")},
+    tasks={"push-point": Task("push-point", "push the point to the goal")},
     suites={"POINT": ("push-point",)},
     horizon=60,
     cameras=("above",),

@@ -87,7 +87,7 @@ def register_recorded(
 
     Its name in capitals is a suite of all tasks.
     """
-    tasks = {task: Task(task, instruction, "recorded") for task, instruction in instructions.items()}
+    tasks = {task: Task(task, instruction) for task, instruction in instructions.items()}
     suites = {name.upper(): tuple(tasks)}
     spec = EnvironmentSpec(name, actions, observation, tasks, suites, 10_000, (camera,))
     EnvironmentPart(name)(lambda: spec)

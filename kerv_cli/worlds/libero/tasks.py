@@ -29,6 +29,6 @@ for _change in CHANGES:
         _name, _group = _row["name"] + _change, _row["suite"] + _change
         _said = re.sub(r"^[A-Z_]+_SCENE\d+_", "", _row["file"]).replace("_", " ")
         _said = _row.get(_change[1:]) or _said
-        TASKS[_name] = Task(_name, _said, _group, HORIZONS[_row["suite"]], _group == "spatial")
+        TASKS[_name] = Task(_name, _said, HORIZONS[_row["suite"]], _group == "spatial")
         FILES[_name] = f"libero_{_group}", _row["file"]
         SUITES[f"LIBERO_{_group}".upper()] = (*SUITES.get(f"LIBERO_{_group}".upper(), ()), _name)

@@ -1,4 +1,4 @@
-"""The 50 tasks of Meta-World v3: names, instructions, difficulty groups and suites.
+"""The 50 tasks of Meta-World v3: names, instructions and suites.
 
 Meta-World's published instructions are the same for push and push-back. The instructions in `tasks.csv` all differ.
 They have at most ten lower-case words and describe what the experts do. Match tasks to published tables by name, not by
@@ -19,7 +19,7 @@ TASKS: dict[str, Task] = {}  # by full name, in alphabetical order
 with Path(__file__).with_name("tasks.csv").open(encoding="utf-8") as _file:
     for _row in csv.DictReader(_file):
         _name = f"{_row['task']}{SUFFIX}"
-        TASKS[_name] = Task(_name, _row["instruction"], _row["difficulty"])
+        TASKS[_name] = Task(_name, _row["instruction"])
 
 _MT10 = (
     "reach push pick-place door-open drawer-open drawer-close button-press-topdown peg-insert-side window-open "

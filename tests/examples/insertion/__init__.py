@@ -33,8 +33,8 @@ SPEC = EnvironmentSpec(
         extra=tuple(range(13, 19)),
     ),
     tasks={
-        "insert-peg": Task("insert-peg", "turn the peg and push it into the tilted slot", "easy"),
-        "fetch-peg": Task("fetch-peg", "pick up the peg and put it into the slot", "hard"),
+        "insert-peg": Task("insert-peg", "turn the peg and push it into the tilted slot"),
+        "fetch-peg": Task("fetch-peg", "pick up the peg and put it into the slot"),
     },
     suites={"INSERTION": ("insert-peg", "fetch-peg")},
     horizon=120,
