@@ -160,6 +160,7 @@ def export(settings: CommandSettings, names: list[str], folder: Folder = None, a
 
     Examples:
         kerv runs export last
+        kerv runs export main --dir exports
     """
     from kerv_cli.base.files import write_text
     from kerv_cli.catalogue.entries import find_run, store_of
