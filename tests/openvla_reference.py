@@ -78,8 +78,7 @@ class Reference:
         from transformers import LlamaConfig, LlamaForCausalLM
 
         numbers = asdict(self.shape.language)
-        rope = {"rope_type": "default", "rope_theta": numbers.pop("rope_theta")}
-        model = LlamaForCausalLM(LlamaConfig(**numbers, rope_parameters=rope))
+        model = LlamaForCausalLM(LlamaConfig(**numbers))
         return self._loaded(model, self._part("language_model."), strict=True)
 
     def patches(self, pixels: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from kerv_cli.engine.acceptance import DistanceRule, accept_by_group
 from kerv_cli.engine.decisions import ROOT, TokenTree, merge
 from kerv_cli.engine.draft import Draft, ancestors_of, ancestors_on_device
 from kerv_cli.methods.context import Context
-from kerv_cli.targets.attention import Cache, attention_mask
+from kerv_cli.targets.attention import Cache, CapturedCache, attention_mask
 from kerv_cli.worlds.metaworld.spec import SPEC
 
 POSITION_GRIPPER = SPEC.actions
@@ -138,7 +138,7 @@ def test_ancestors_are_the_transitive_closure_of_parents(tree):
 @given(trees(), st.integers(0, 9), st.integers(1, 6), st.booleans())
 def test_the_mask_shows_the_cache_what_stands_before_and_the_ancestors(tree, cached, before, fixed):
     like = torch.zeros(())
-    cache = Cache(1, 1, 1, 40, 1, like, fixed)
+    cache = CapturedCache(1, 1, 40, 1, like) if fixed else Cache(1, 1, 1, 40, 1, like)
     cache.length = cached
     n = len(tree)
     mask = attention_mask(visible(tree, before), before + n, cache, like)
@@ -161,7 +161,7 @@ def test_the_mask_shows_the_cache_what_stands_before_and_the_ancestors(tree, cac
 @pytest.mark.parametrize("fixed", [False, True])
 def test_without_a_statement_new_tokens_are_causal(fixed):
     like = torch.zeros(())
-    cache = Cache(1, 1, 1, 8, 1, like, fixed)
+    cache = CapturedCache(1, 1, 8, 1, like) if fixed else Cache(1, 1, 1, 8, 1, like)
     cache.length = 2
     mask = attention_mask(None, 3, cache, like)
     assert (mask.numpy()[:, :5] == 0).tolist() == np.tri(3, 5, 2, dtype=bool).tolist()

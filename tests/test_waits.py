@@ -96,8 +96,6 @@ def test_a_round_waits_once(family, captured, monkeypatch):
     moved(on_host, np.random.default_rng(0), 8)
     wanted = on_host.decode_prompt(prompt)
     assert wanted.tokens == truth
-    if captured:
-        monkeypatch.setattr(LayerStack, "captures", lambda self, x: True)
     parts = parts_of(family, target, prompt, truth)
     monkeypatch.setattr(EagleNetwork, "new_cache", functools.partialmethod(LayerStack.new_cache, fixed=captured))
     target.new_cache = functools.partial(target.new_cache, fixed=captured)  # type: ignore[method-assign]

@@ -158,9 +158,8 @@ class Sizes:
     def of(cls, language: Language, number: float) -> Sizes:
         """Return the sizes of a Llama-style target and of its drafter, which has one layer of the same shape."""
         width, layers = language.hidden_size, language.num_hidden_layers
-        keys = round(width * language.key_value_heads / language.num_attention_heads)
-        layer = 2 * width**2 + 2 * width * keys + 3 * width * language.intermediate_size
-        head, channels, cached = width * language.vocab_size, layers * width, 2 * layers * keys
+        layer = 4 * width**2 + 3 * width * language.intermediate_size
+        head, channels, cached = width * language.vocab_size, layers * width, 2 * layers * width
         return cls(layers * layer, head, layer + 2 * width**2 + head, channels, cached, number, number)
 
     @property

@@ -26,10 +26,10 @@ class Cache:
         heads: A, number of heads.
         channels: C, channels of a head.
         like: Tensor whose device and number format the cache gets.
-        fixed: Whether every forward attends to all slots, and a mask hides the unused ones. All shapes are then fixed,
-            as CUDA graphs require.
 
     Attributes:
+        fixed: Whether every forward attends to all slots, and a mask hides the unused ones. All shapes are then fixed,
+            as CUDA graphs require.
         buffer: (layers, 2, B, A, slots, C) keys and values. A fixed cache has a spare slot after its capacity.
         layers: (2, B, A, slots, C) per layer, views of the buffer.
         length: Number of cached tokens. They are in the first slots.
@@ -37,11 +37,10 @@ class Cache:
             exceed `length`. Then only the first `length` slots count.
     """
 
-    def __init__(
-        self, layers: int, batch: int, heads: int, capacity: int, channels: int, like: Tensor, fixed: bool = False
-    ) -> None:
-        self.fixed = fixed
-        slots = capacity + fixed  # a spare slot, for the unused rows of a CUDA graph
+    fixed = False
+
+    def __init__(self, layers: int, batch: int, heads: int, capacity: int, channels: int, like: Tensor) -> None:
+        slots = capacity + self.fixed  # a spare slot, for the unused rows of a CUDA graph
         self.buffer = like.new_zeros((layers, 2, batch, heads, slots, channels))
         self.layers = list(self.buffer)  # (2, B, A, slots, C): keys, values
         self.capacity = capacity
@@ -73,11 +72,9 @@ class Cache:
         self.buffer[..., start : start + n, :] = self.buffer.index_select(-2, slots)
         self.length, self.copied = start + n, min(self.copied, start)
 
-    def next_slots(self, tokens: int) -> Slots:
-        """Return the slots of the next tokens: a slice, or indices (tokens,) if the cache has fixed shapes."""
-        start, stop = self.length, self.length + tokens
-        self.copied = min(self.copied, start)
-        return torch.arange(start, stop, device=self.buffer.device) if self.fixed else slice(start, stop)
+    def next_slots(self, tokens: int) -> slice:
+        self.copied = min(self.copied, self.length)
+        return slice(self.length, self.length + tokens)
 
 
 Slots = slice | Tensor | None  # that a forward writes to; indices (T,) if the cache has fixed shapes
@@ -89,9 +86,9 @@ def attend(q: Tensor, k: Tensor, v: Tensor, cache: Tensor | None, slots: Slots, 
 
     Args:
         q: (B, A, T, C) queries of A heads.
-        k: (B, K, T, C) keys of K heads. If K < A, several query heads share a head of keys.
-        v: (B, K, T, C) values of K heads.
-        cache: (2, B, K, slots, C) keys and values of this layer. None if there are no earlier tokens.
+        k: (B, A, T, C) keys.
+        v: (B, A, T, C) values.
+        cache: (2, B, A, slots, C) keys and values of this layer. None if there are no earlier tokens.
         mask: Result of `attention_mask`. If None, attention is causal.
     """
     causal = mask is None and q.shape[2] > 1
@@ -104,8 +101,7 @@ def attend(q: Tensor, k: Tensor, v: Tensor, cache: Tensor | None, slots: Slots, 
         cache[1][:, :, slots] = v
         if slots.start:
             k, v = cache[:, :, :, : slots.stop]
-    shared = k.shape[1] != q.shape[1]
-    attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, is_causal=causal, enable_gqa=shared)
+    attended = F.scaled_dot_product_attention(q, k, v, attn_mask=mask, is_causal=causal)
     return attended.transpose(1, 2).flatten(2)
 
 
@@ -178,8 +174,10 @@ class CapturedCache(Cache):
         steps: The graphs, by number of tokens. Empty before the first forward on a GPU.
     """
 
-    def __init__(self, layers: int, batch: int, heads: int, capacity: int, channels: int, like: Tensor) -> None:
-        super().__init__(layers, batch, heads, capacity, channels, like, fixed=True)
+    fixed = True
+
+    def __init__(self, layers: int, heads: int, capacity: int, channels: int, like: Tensor) -> None:
+        super().__init__(layers, 1, heads, capacity, channels, like)
         self.steps: dict[int, _Step] = {}
 
     def run(self, compute: Compute, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:

@@ -74,4 +74,4 @@ class BuildTargetSettings(RunSettings):
     libero: bool = setting(
         False, "first compress the image as JPEG and resize it by Lanczos, as OpenVLA's evaluation on LIBERO does"
     )
-    prompt_tokens: int = number(64, 1, 65_536, help="longest prompt in tokens, without the vision tokens")
+    prompt_tokens: int = number(64, 1, 512, help="longest prompt in tokens, without the vision tokens")

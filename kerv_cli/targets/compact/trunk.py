@@ -116,13 +116,14 @@ class LayerStack(Compilable):
         return self.norm(x if self.width == self.outer else x[..., : self.outer])
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
-        """Return an empty key/value cache. `fixed` is whether all its shapes are fixed. If None, only on CUDA."""
+        """Return an empty key/value cache. `fixed`: for CUDA graphs of one sequence. If None, only on CUDA."""
         like = self.weight
         if self.compiled is not None:
             like = like.float()
-        sizes = self.depth, batch, self.heads, capacity + self.padding, self.width // self.heads
-        fixed = like.is_cuda if fixed is None else fixed
-        return CapturedCache(*sizes, like) if fixed else Cache(*sizes, like)
+        sizes = self.heads, capacity + self.padding, self.width // self.heads
+        if batch == 1 and (like.is_cuda if fixed is None else fixed):
+            return CapturedCache(self.depth, *sizes, like)
+        return Cache(self.depth, batch, *sizes, like)
 
     def new_program(self) -> Program:
         return Program(self.recorded, *[(1, 1, self.outer)] * self.inputs)
@@ -146,20 +147,17 @@ class LayerStack(Compilable):
                 seen = F.pad(F.pad(seen, (0, padding)), (0, 0, 0, padding), value=True)
         x = inputs[0]
         mask = attention_mask(seen, x.shape[1], cache, x)
-        if self.runs_compiled(x) and not (cache is not None and cache.fixed):
-            hidden = self.compiled(*inputs, positions=positions, cache=cache, mask=mask)[0].view(x.shape).to(x.dtype)
-        elif isinstance(cache, CapturedCache) and self.captures(x):
+        if isinstance(cache, CapturedCache):
             assert mask is not None
             hidden = self.finish(cache.run(self.run_layers, self.begin(*inputs), positions, mask))
+        elif self.runs_compiled(x):
+            hidden = self.compiled(*inputs, positions=positions, cache=cache, mask=mask)[0].view(x.shape).to(x.dtype)
         else:
             slots = cache.next_slots(x.shape[1]) if cache is not None else None
             hidden = self.finish(self.run_layers(self.begin(*inputs), positions, cache, slots, mask))
         if cache is not None:
             cache.length += tokens  # the next forward overwrites the padding
         return hidden[:, :tokens]
-
-    def captures(self, x: Tensor) -> bool:
-        return x.is_cuda and x.shape[0] == 1 and not (x.requires_grad and torch.is_grad_enabled())
 
     def recorded(self, *inputs: Tensor) -> Tensor:
         """Record the layers' operations on one token, to compile them. Inputs and result are `Recorded` (1, 1, E)."""

@@ -70,20 +70,7 @@ class Language:
     intermediate_size: int = 11008
     num_hidden_layers: int = 32
     num_attention_heads: int = 32
-    num_key_value_heads: int | None = None
     rms_norm_eps: float = 1e-6
-    rope_theta: float = 10_000.0
-
-    @property
-    def key_value_heads(self) -> int:
-        return self.num_key_value_heads or self.num_attention_heads
-
-    @property
-    def channels(self) -> int:
-        return self.hidden_size // self.num_attention_heads
-
-    def cache_sizes(self, batch: int, capacity: int) -> tuple[int, int, int, int, int]:
-        return self.num_hidden_layers, batch, self.key_value_heads, capacity, self.channels
 
 
 @dataclass(frozen=True)
@@ -114,8 +101,11 @@ class Shape:
 def read_shape(folder: Path) -> Shape:
     path, value = folder / CONFIG, read_config(folder)
     text = value.get("text_config")
-    if not isinstance(text, Mapping) or text.get("model_type", "llama") != "llama" or text.get("rope_scaling"):
-        raise CheckpointError(f"{path} has no text_config of a Llama without rope_scaling: it cannot be loaded")
+    if not isinstance(text, Mapping) or text.get("model_type", "llama") != "llama":
+        raise CheckpointError(f"{path} has no text_config of a Llama: it cannot be loaded")
+    for name in ("rope_scaling", "rope_theta", "num_key_value_heads"):
+        if text.get(name) not in (None, 10_000, text.get("num_attention_heads")):
+            raise CheckpointError(f"{path} has a text_config with {name}={text[name]}: it is not of a Llama-2 7B")
     towers = value.get(SHAPES)
     if towers is None:
         names = value.get("timm_model_ids")

@@ -17,12 +17,13 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from torch import Tensor, nn
+from torch import Tensor
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.base.files import sha256_of, visible
+from kerv_cli.targets.compact.trunk import Rotary
 from kerv_cli.targets.openvla.config import CONFIG, Shape
-from kerv_cli.targets.openvla.network import OpenVLAModel
+from kerv_cli.targets.openvla.network import OpenVLAModel, published
 
 Sizes = tuple[int, ...]
 PICKLED = (".bin", ".pt", ".pth", ".ckpt")
@@ -107,7 +108,12 @@ def check_layout(shapes: Mapping[str, Sizes], expected: Mapping[str, Sizes], whe
 
 def layout(shape: Shape) -> dict[str, Sizes]:
     with torch.device("meta"):
-        return sizes_of(OpenVLAModel(shape))
+        state = OpenVLAModel(shape).state_dict()
+    sizes = {}
+    for name, tensor in state.items():
+        parts = published(name)
+        sizes |= dict.fromkeys(parts, (len(tensor) // len(parts), *tensor.shape[1:]))
+    return sizes
 
 
 def is_unread(name: str, shape: Shape) -> bool:
@@ -117,10 +123,6 @@ def is_unread(name: str, shape: Shape) -> bool:
     return re.match(rf"vision_backbone\.({last}|\w+\.norm|\w+\.attn_pool)\.", name) is not None
 
 
-def sizes_of(module: nn.Module) -> dict[str, Sizes]:
-    return {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
-
-
 def open_checked(folder: Path, shape: Shape) -> Shards:
     shards = open_shards(folder)
     check_layout({n: s for n, s in shards.shapes.items() if not is_unread(n, shape)}, layout(shape), folder)
@@ -128,12 +130,16 @@ def open_checked(folder: Path, shape: Shape) -> Shards:
 
 
 def load_model(folder: Path, shape: Shape, device: str, dtype: torch.dtype) -> OpenVLAModel:
-    shards = open_checked(folder, shape)
+    tensors = dict(open_checked(folder, shape).items())
     with torch.device("meta"):
         model = OpenVLAModel(shape)
-    names = model.state_dict().keys()
-    state = {n: t.to(device=device, dtype=dtype) for n, t in shards.items() if n in names}
+    state = {}
+    for name in model.state_dict():
+        parts = [tensors.pop(part).to(device=device, dtype=dtype) for part in published(name)]
+        state[name] = parts[0] if len(parts) == 1 else torch.cat(parts)
     model.load_state_dict(state, assign=True)
+    trunk = model.language_model.model
+    trunk.rotary = Rotary(trunk.width // trunk.heads).to(device, dtype)
     return model.eval().requires_grad_(False)
 
 

@@ -1,15 +1,14 @@
-"""The network of OpenVLA: two vision towers, a projector, and Llama-2 with tree attention over a key/value cache.
+"""The network of OpenVLA: two vision towers, a projector, and Llama-2 as the compact target's trunk.
 
-Modules have the names that published checkpoints use, so that their weights can be memory-mapped. Weights without
-effect are left out: the last block of each tower (OpenVLA takes the output of the block before it), the final norm, and
-SigLIP's pooling head.
+Weights without effect are left out: the last block of each tower (OpenVLA takes the output of the block before it), the
+final norm, and SigLIP's pooling head.
 
-Shapes: B batch, T new tokens, S cached tokens, E width of the language model, A heads, K heads of keys and values, C
-channels of a head; h × w pixels of an image, n patches, W width of a tower.
+Shapes: B batch, h × w pixels of an image, n patches, W width of a tower.
 """
 
 from __future__ import annotations
 
+import re
 from collections import OrderedDict
 from functools import partial
 
@@ -17,107 +16,37 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from kerv_cli.engine.protocol import Seen
-from kerv_cli.targets.attention import Cache, Rotation, Slots, attend, attention_mask, rotate
+from kerv_cli.targets.compact.trunk import Trunk
 from kerv_cli.targets.openvla.config import Language, Shape, Tower
 
 EPSILON = 1e-6  # of every layer norm
+# part of a decoder layer -> the names, in published checkpoints, of the matrices whose rows it holds
+LAYER = {
+    "attention_norm": ["input_layernorm"],
+    "qkv": ["self_attn.q_proj", "self_attn.k_proj", "self_attn.v_proj"],
+    "out": ["self_attn.o_proj"],
+    "feed_norm": ["post_attention_layernorm"],
+    "gate_up": ["mlp.gate_proj", "mlp.up_proj"],
+    "down": ["mlp.down_proj"],
+}
 
 
-def rotation(positions: Tensor, channels: int, theta: float, dtype: torch.dtype) -> Rotation:
-    """Return the cosines and sines (T, C) at positions (T,) in half-split layout, computed in float32.
-
-    In the first half of the channels the sines have the reversed sign, as `attention.rotate` requires.
-    """
-    frequencies = theta ** (-torch.arange(0, channels, 2, device=positions.device, dtype=torch.float32) / channels)
-    angles = positions[:, None].float() * frequencies
-    cos, sin = angles.cos(), angles.sin()
-    return torch.cat([cos, cos], -1).to(dtype), torch.cat([-sin, sin], -1).to(dtype)
+def published(name: str) -> list[str]:
+    """Return the names of the tensors in published checkpoints whose rows make the model's tensor `name`."""
+    match = re.fullmatch(r"(language_model\.model\.layers\.\d+)\.(\w+)\.weight", name)
+    return [f"{match[1]}.{part}.weight" for part in LAYER[match[2]]] if match else [name]
 
 
-class LlamaAttention(nn.Module):
-    """Rotary self-attention. Several query heads may share a head of keys and values."""
-
-    def __init__(self, language: Language) -> None:
-        super().__init__()
-        width, inner = language.hidden_size, language.key_value_heads * language.channels
-        self.heads, self.shared = language.num_attention_heads, language.key_value_heads
-        self.q_proj = nn.Linear(width, width, bias=False)
-        self.k_proj = nn.Linear(width, inner, bias=False)
-        self.v_proj = nn.Linear(width, inner, bias=False)
-        self.o_proj = nn.Linear(width, width, bias=False)
-
-    def forward(
-        self, x: Tensor, rotary: Rotation, mask: Tensor | None, cache: Tensor | None = None, slots: Slots = None
-    ) -> Tensor:
-        q = rotate(self.q_proj(x).unflatten(-1, (self.heads, -1)).transpose(1, 2), *rotary)
-        k = rotate(self.k_proj(x).unflatten(-1, (self.shared, -1)).transpose(1, 2), *rotary)
-        v = self.v_proj(x).unflatten(-1, (self.shared, -1)).transpose(1, 2)
-        return self.o_proj(attend(q, k, v, cache, slots, mask))
-
-
-class LlamaPerceptron(nn.Module):
-    """Feed-forward part of a layer (SwiGLU)."""
+class Llama(Trunk):
+    """The language model without its head."""
 
     def __init__(self, language: Language) -> None:
-        super().__init__()
-        width, hidden = language.hidden_size, language.intermediate_size
-        self.gate_proj = nn.Linear(width, hidden, bias=False)
-        self.up_proj = nn.Linear(width, hidden, bias=False)
-        self.down_proj = nn.Linear(hidden, width, bias=False)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.down_proj(F.silu(self.gate_proj(x)) * self.up_proj(x))
-
-
-class LlamaLayer(nn.Module):
-    """One pre-norm decoder layer."""
-
-    def __init__(self, language: Language) -> None:
-        super().__init__()
-        width, epsilon = language.hidden_size, language.rms_norm_eps
-        self.input_layernorm = nn.RMSNorm(width, eps=epsilon)
-        self.self_attn = LlamaAttention(language)
-        self.post_attention_layernorm = nn.RMSNorm(width, eps=epsilon)
-        self.mlp = LlamaPerceptron(language)
-
-    def forward(
-        self, x: Tensor, rotary: Rotation, mask: Tensor | None, cache: Tensor | None = None, slots: Slots = None
-    ) -> Tensor:
-        """Return the layer's output (B, T, E) for x (B, T, E). `cache` (2, B, K, capacity, C) is this layer's."""
-        x = x + self.self_attn(self.input_layernorm(x), rotary, mask, cache, slots)
-        return x + self.mlp(self.post_attention_layernorm(x))
-
-
-class LlamaModel(nn.Module):
-    """The language model without its head: token embeddings, layers and final norm."""
-
-    def __init__(self, language: Language) -> None:
-        super().__init__()
-        self.language = language
+        sizes = language.num_hidden_layers, language.num_attention_heads, language.intermediate_size
+        super().__init__(language.hidden_size, *sizes)
         self.embed_tokens = nn.Embedding(language.vocab_size, language.hidden_size)
-        self.layers = nn.ModuleList(LlamaLayer(language) for _ in range(language.num_hidden_layers))
-        self.norm = nn.RMSNorm(language.hidden_size, eps=language.rms_norm_eps)
-
-    def forward(self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: Seen = None) -> Tensor:
-        language, tokens = self.language, x.shape[1]
-        mask = attention_mask(seen, tokens, cache, x)
-        rotary = rotation(positions, language.channels, language.rope_theta, x.dtype)
-        slots = cache.next_slots(tokens) if cache is not None else None
-        for i, layer in enumerate(self.layers):
-            x = layer(x, rotary, mask, cache.layers[i] if cache is not None else None, slots)
-        if cache is not None:
-            cache.length += tokens
-        return self.norm(x)
-
-
-class LanguageModel(nn.Module):
-    """The language model with its head, which gives a logit for every id of the vocabulary."""
-
-    def __init__(self, language: Language) -> None:
-        super().__init__()
-        self.model = LlamaModel(language)
-        self.lm_head = nn.Linear(language.hidden_size, language.vocab_size, bias=False)
+        for part in self.modules():
+            if isinstance(part, nn.RMSNorm):
+                part.eps = language.rms_norm_eps
 
 
 def named(**layers: nn.Module) -> nn.Sequential:
@@ -212,10 +141,12 @@ def projector(shape: Shape) -> nn.Sequential:
 
 
 class OpenVLAModel(nn.Module):
-    """All modules of an OpenVLA. They have the names that published checkpoints use."""
+    """All modules of an OpenVLA. Except for the layers' (`LAYER`), they have the names in published checkpoints."""
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
+        language = shape.language
         self.vision_backbone = VisionBackbone(shape)
         self.projector = projector(shape)
-        self.language_model = LanguageModel(shape.language)
+        head = nn.Linear(language.hidden_size, language.vocab_size, bias=False)
+        self.language_model = named(model=Llama(language), lm_head=head)

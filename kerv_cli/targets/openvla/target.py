@@ -81,7 +81,8 @@ class OpenVLATarget:
         self.segments = {"begin": begin, "vision": vision, "instruction": slice(vision.stop, None)}
         last = shape.vocabulary
         self.action_rows = model.language_model.lm_head.weight[last - shape.bins : last].flip(0).contiguous()
-        self.layers = model.language_model.model.layers
+        self.trunk: Any = model.language_model.model
+        self.layers = self.trunk.layers
         self.device, self.dtype = self.action_rows.device, self.action_rows.dtype
         self.words = functools.lru_cache(maxsize=64)(self._words)
 
@@ -101,17 +102,16 @@ class OpenVLATarget:
 
     def _words(self, instruction: str) -> Tensor:
         ids = upload([self.prompter.ids(instruction)], self.device)
-        return self.model.language_model.model.embed_tokens(ids)
+        return self.trunk.embed_tokens(ids)
 
     def embed(self, tokens: Tensor) -> Tensor:
-        return self.model.language_model.model.embed_tokens(self.shape.vocabulary - 1 - tokens)
+        return self.trunk.embed_tokens(self.shape.vocabulary - 1 - tokens)
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
-        fixed = self.action_rows.is_cuda if fixed is None else fixed
-        return Cache(*self.shape.language.cache_sizes(batch, capacity), self.action_rows, fixed)
+        return self.trunk.new_cache(batch, capacity, fixed)
 
     def forward(self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: Seen = None) -> Tensor:
-        return self.model.language_model.model(x, positions, cache, seen)
+        return self.trunk(x, positions, cache, seen)
 
     def head(self, hidden: Tensor) -> Tensor:
         """Return the logits (..., V) of the action tokens only."""
