@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
 from kerv_cli.base.registry import ProposerPart, find
 from kerv_cli.base.runtime import set_up
@@ -16,21 +18,9 @@ from kerv_cli.lab.runs import command_to_go_on
 from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.drafters import TrainableDrafter
 from kerv_cli.targets.checkpoint import load_target
-from kerv_cli.targets.provenance import provenance_of
+from kerv_cli.training import fit
 from kerv_cli.training.demonstrations import check_tasks, demos_for
-from kerv_cli.training.fit import (
-    FEW,
-    Destination,
-    Loss,
-    Metrics,
-    batches,
-    figures_of,
-    fit,
-    identity_of,
-    seconds_of,
-    without_subnormals,
-)
-from kerv_cli.training.settings import Plan, Stage, TrainDrafterSettings
+from kerv_cli.training.settings import Plan, TrainDrafterSettings
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
@@ -38,41 +28,31 @@ SAMPLES = 64  # decodes of which `--plan` measures the time
 
 
 @dataclass(frozen=True)
-class DrafterTraining:
+class DrafterTraining(fit.Training):
     """A training of a drafter whose settings are checked."""
 
-    settings: TrainDrafterSettings
     drafter: TrainableDrafter
     artifacts: Artifacts
-    dataset: DemoDataset
-    place: Destination
+    command = "kerv train drafter"
+    reading = "the target's greedy decodes"
 
-    def work(self, stage: Stage) -> tuple[Path, Metrics]:
-        drafter, settings, train = self.drafter, self.settings, self.settings.train
-        provenance = provenance_of("kerv train drafter", settings, set_up(settings.runtime)[0])
-        made_for, shape = MadeFor.of(self.artifacts.description), asdict(settings.drafter)
-        with self.place.opened() as folder, without_subnormals():
-            with stage("the target's greedy decodes") as progress:
-                target = self.target()
-                examples, held_out = drafter.examples(target, self.dataset, settings.drafter, train.held_out, progress)
-            network, loss = self.network(target, examples)
+    def ready(self, dataset: DemoDataset, progress: Callable[..., None]) -> fit.Ready:
+        drafter, settings, target = self.drafter, self.settings, self.target()
+        held_out, shape = settings.train.held_out, settings.drafter
+        examples, rest = drafter.examples(target, dataset, shape, held_out, progress)
+        network, loss = self.network(target, examples)
+        validate = torch.no_grad()(lambda network: drafter.validate(network, target, rest, settings))
+        made_for = MadeFor.of(self.artifacts.description)
 
-            @torch.no_grad()
-            def validate(network: Any) -> Metrics:
-                return drafter.validate(network, target, held_out, settings)
+        def write(folder: Path, network: nn.Module, provenance: dict[str, Any]) -> None:
+            drafter.save(folder, network, made_for, provenance, settings.train.stored, settings=asdict(shape))
 
-            def save(network: Any, metrics: Metrics) -> None:
-                made = provenance | figures_of(self.dataset, network, metrics)
-                drafter.save(folder, network, made_for, made, train.stored, settings=shape)
-
-            with stage("training the drafter") as progress:
-                metrics = fit(network, loss, validate, save, train, folder, self.place.identity, progress)
-        return self.place.folder, metrics
+        return network, loss, validate, write
 
     def seconds(self) -> float:
         """Measure a few decodes and steps on a few demonstrations, and estimate the time of all."""
         drafter, dataset, held_out = self.drafter, self.dataset, self.settings.train.held_out
-        few, target, own = replace(dataset, episodes=dataset.episodes[:FEW]), self.target(), self.settings.drafter
+        few, target, own = replace(dataset, episodes=dataset.episodes[: fit.FEW]), self.target(), self.settings.drafter
         stride = int(dataset.manifest.config["frame_stride"]) if target.cameras else 1  # control steps per observation
         sample, decodes = own, sum(episode.steps for episode in dataset.episodes) // stride
         if hasattr(own, "samples"):
@@ -84,23 +64,23 @@ class DrafterTraining:
             times.append(clock.stop())
         of_decodes = min(times) * decodes / (len(examples) + len(rest))
         _, loss = self.network(target, examples)
-        return of_decodes + seconds_of(loss, self.settings.train, target.device)
+        return of_decodes + fit.seconds_of(loss, self.settings.train, target.device)
 
     def target(self) -> Any:
         device, dtype = set_up(self.settings.runtime)
         return load_target(self.artifacts.folder, device, dtype)[0]
 
-    def network(self, target: Any, examples: Any) -> tuple[Any, Loss]:
+    def network(self, target: Any, examples: Any) -> tuple[Any, fit.Loss]:
         train = self.settings.train
         torch.manual_seed(train.seed)
         network: Any = self.drafter.network(self.settings.drafter, target)
         self.drafter.prepare(network, examples)
         network.to(target.device)
-        draw = batches(len(examples), train)
+        draw = fit.batches(len(examples), train)
         return network, lambda step: self.drafter.loss(network, target, examples.where(draw(step)), step, self.settings)
 
 
-def plan_drafter(settings: TrainDrafterSettings, database: Database) -> Plan[tuple[Path, Metrics]]:
+def plan_drafter(settings: TrainDrafterSettings, database: Database) -> Plan[tuple[Path, fit.Metrics]]:
     """Plan the training of a drafter. The plan, when executed, returns its folder and the best weights' metrics.
 
     The target decodes in `runtime.dtype`. The drafter is trained in float32. An interrupted training goes on.
@@ -121,11 +101,12 @@ def plan_drafter(settings: TrainDrafterSettings, database: Database) -> Plan[tup
     imitated = {"drafter": shape, "target": description.sha256, "task": list(tasks)}
     if settings.runtime.dtype != "float32":  # left out, so that trainings from before it counted can be resumed
         imitated["dtype"] = settings.runtime.dtype
-    identity, begun = identity_of(train, dataset, **imitated), bool(command_to_go_on(database, drafter.kind, folder))
-    place = Destination(folder, identity, train.steps, f"policy.artifacts.{drafter.kind}", settings.replace, begun)
-    place.check()
+    identity, begun = (
+        fit.identity_of(train, dataset, **imitated),
+        bool(command_to_go_on(database, drafter.kind, folder)),
+    )
+    place = fit.Destination(folder, identity, train.steps, f"policy.artifacts.{drafter.kind}", settings.replace, begun)
     layers = f"{shape['layers']}-layer " if "layers" in shape else ""
     samples = f", greedy decodes of {shape['samples']} observations" if "samples" in shape else ""
-    text = f"{folder}: {layers}{drafter.noun} of {artifacts.folder}{samples}, {train.steps} steps of {train.batch}"
-    training = DrafterTraining(settings, drafter, artifacts, dataset, place)
-    return Plan(drafter.kind, folder, text, training.work, place.check, training.seconds)
+    text = f"{layers}{drafter.noun} of {artifacts.folder}{samples}, {train.steps} steps of {train.batch}"
+    return DrafterTraining(settings, dataset, place, drafter, artifacts).plan(drafter.kind, text)

@@ -14,12 +14,13 @@ import sys
 import threading
 import time
 import zipfile
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -27,9 +28,11 @@ from torch import Tensor, nn
 from kerv_cli.base.errors import CheckpointError, Interrupted, KervError, UsageError
 from kerv_cli.base.files import link_files, remove, unfinished, visible, write_bytes, write_folder, write_if_changed
 from kerv_cli.base.paths import RESUME, check_free
+from kerv_cli.base.runtime import set_up
 from kerv_cli.engine.decoder import Stopwatch
 from kerv_cli.episodes.identity import hash_of
-from kerv_cli.training.settings import TrainSettings
+from kerv_cli.targets.provenance import provenance_of
+from kerv_cli.training.settings import Plan, Stage, TrainSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
 Metrics = dict[str, float]
@@ -326,9 +329,46 @@ def read_state(path: Path) -> dict[str, Any]:
     return state
 
 
-def figures_of(dataset: DemoDataset, network: Any, metrics: dict[str, float]) -> dict[str, Any]:
-    return {
-        "demos": {"sha256": dataset.sha256, "config": dataset.manifest.config},
-        "validation": metrics,
-        "parameters": sum(parameter.numel() for parameter in network.parameters()),
-    }
+# Takes a folder, a network and the provenance of its weights, and writes them
+Write = Callable[[Path, Any, dict[str, Any]], object]
+Ready = tuple[nn.Module, Loss, Validate, Write]
+
+
+@dataclass(frozen=True)
+class Training(ABC):
+    """A training whose settings are checked. A subclass makes the network and its samples."""
+
+    settings: Any
+    dataset: DemoDataset
+    place: Destination
+    command: ClassVar[str]
+    reading: ClassVar[str]  # title of the stage that makes the samples
+
+    @abstractmethod
+    def ready(self, dataset: DemoDataset, progress: Callable[..., None]) -> Ready:
+        """Make the network, and its samples from demonstrations."""
+
+    @abstractmethod
+    def seconds(self) -> float:
+        """Estimate the time of all steps from a few of them."""
+
+    def plan(self, kind: str, text: str) -> Plan[tuple[Path, Metrics]]:
+        self.place.check()
+        folder = self.place.folder
+        return Plan(kind, folder, f"{folder}: {text}", self.work, self.place.check, self.seconds)
+
+    def work(self, stage: Stage) -> tuple[Path, Metrics]:
+        settings, dataset, place = self.settings, self.dataset, self.place
+        provenance = provenance_of(self.command, settings, set_up(settings.runtime)[0])
+        with place.opened() as folder, without_subnormals():
+            with stage(self.reading) as progress:
+                network, loss, validate, write = self.ready(dataset, progress)
+
+            def save(network: Any, metrics: Metrics) -> None:
+                demos = {"sha256": dataset.sha256, "config": dataset.manifest.config}
+                size = sum(parameter.numel() for parameter in network.parameters())
+                write(folder, network, {**provenance, "demos": demos, "validation": metrics, "parameters": size})
+
+            with stage("training") as progress:
+                metrics = fit(network, loss, validate, save, settings.train, folder, place.identity, progress)
+        return place.folder, metrics

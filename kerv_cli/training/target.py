@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -34,22 +35,10 @@ from kerv_cli.targets.compact.features import WordTokenizer, places_of
 from kerv_cli.targets.compact.target import CompactTarget, save_target
 from kerv_cli.targets.losses import labels_of, position_loss, token_loss, within_chunk
 from kerv_cli.targets.observations import Observations, read_chunks, read_observations, split
-from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.targets.settings import TargetSettings
+from kerv_cli.training import fit
 from kerv_cli.training.demonstrations import check_spaces, check_tasks, name_of, open_demos, seen_by
-from kerv_cli.training.fit import (
-    FEW,
-    Destination,
-    Loss,
-    Metrics,
-    batches,
-    figures_of,
-    fit,
-    identity_of,
-    seconds_of,
-    without_subnormals,
-)
-from kerv_cli.training.settings import Plan, Stage, TrainSettings, TrainTargetSettings, refuse_unused
+from kerv_cli.training.settings import Plan, TrainSettings, TrainTargetSettings, refuse_unused
 from kerv_cli.worlds import resolve_tasks, settled, spec_of, specs
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.files import DemoEpisode
@@ -65,54 +54,39 @@ VALIDATED = 2048  # maximum number of samples in a validation
 
 
 @dataclass(frozen=True)
-class TargetTraining:
+class TargetTraining(fit.Training):
     """A training of a compact policy whose settings are checked."""
 
-    settings: TrainTargetSettings
-    dataset: DemoDataset
     tasks: tuple[str, ...]
     world: WorldSettings
     init: Path | None  # folder of the target whose weights it starts from
-    place: Destination
+    command = "kerv train target"
+    reading = "reading demonstrations"
 
-    def work(self, stage: Stage) -> tuple[Path, Metrics]:
-        dataset, train = self.dataset, self.settings.train
-        provenance = provenance_of("kerv train target", self.settings, set_up(self.settings.runtime)[0])
-        provenance |= origin_of(self.init)
-        with self.place.opened() as folder, without_subnormals():
-            with stage("reading demonstrations") as progress:
-                target, imitation, loss = self.loaded(dataset, self.tasks, progress)
-            states = functools.cache(lambda: state_range(dataset))
-
-            def save(target: CompactTarget, metrics: Metrics) -> None:
-                made = provenance | figures_of(dataset, target, metrics)
-                save_target(folder, target, dataset.manifest.environment, made, train.stored, states())
-
-            with stage("training the target") as progress:
-                metrics = fit(target, loss, imitation.validate, save, train, folder, self.place.identity, progress)
-        return self.place.folder, metrics
-
-    def seconds(self) -> float:
-        """Measure a few steps on demonstrations of one task, and estimate the time of all steps."""
-        dataset, tasks = self.dataset, self.tasks[:1]
-        few = replace(dataset, episodes=[dataset.episodes[index] for index in dataset.of_tasks(*tasks)[:FEW]])
-        target, _, loss = self.loaded(few, tasks, lambda done, total: None)
-        return seconds_of(loss, self.settings.train, target.device)
-
-    def loaded(
-        self, dataset: DemoDataset, tasks: tuple[str, ...], progress: OnProgress
-    ) -> tuple[CompactTarget, Imitation, Loss]:
-        """Make the network, and read its samples from demonstrations."""
-        train, (device, _) = self.settings.train, set_up(self.settings.runtime)
+    def ready(self, dataset: DemoDataset, progress: OnProgress) -> fit.Ready:
+        train, (device, _), tasks = self.settings.train, set_up(self.settings.runtime), self.tasks
         target, samples = load_training(self.settings, dataset, tasks, self.init, self.world.camera.name, progress)
         seeds = spec_of(tasks[0]).seeds.selection[: train.closed_loop]
         success = functools.partial(success_of, tasks=tasks, seeds=seeds, settings=self.world) if seeds else None
         imitation = Imitation(target.to(device), samples, train, success)
-        draw = batches(len(imitation.training), train, imitation.weights)
-        return target, imitation, lambda step: imitation.loss(draw(step), step)
+        draw = fit.batches(len(imitation.training), train, imitation.weights)
+        states = functools.cache(lambda: state_range(dataset))
+
+        def write(folder: Path, target: CompactTarget, provenance: dict[str, Any]) -> None:
+            made = provenance | origin_of(self.init)
+            save_target(folder, target, dataset.manifest.environment, made, train.stored, states())
+
+        return target, lambda step: imitation.loss(draw(step), step), imitation.validate, write
+
+    def seconds(self) -> float:
+        """Measure a few steps on demonstrations of one task, and estimate the time of all steps."""
+        chosen = self.dataset.of_tasks(self.tasks[0])[: fit.FEW]
+        few = replace(self.dataset, episodes=[self.dataset.episodes[index] for index in chosen])
+        target, loss, *_ = self.ready(few, lambda *done: None)
+        return fit.seconds_of(loss, self.settings.train, next(target.parameters()).device)
 
 
-def plan_target(settings: TrainTargetSettings, database: Database) -> Plan[tuple[Path, Metrics]]:
+def plan_target(settings: TrainTargetSettings, database: Database) -> Plan[tuple[Path, fit.Metrics]]:
     """Check a training of a compact policy. Its work returns the target's folder and the metrics of the best weights.
 
     It fills in `settings.demos`, `settings.task` and `settings.train.places`. An interrupted training goes on.
@@ -130,18 +104,16 @@ def plan_target(settings: TrainTargetSettings, database: Database) -> Plan[tuple
     shapes = asdict(settings.target)
     if settings.target.code == "bins":  # left out, so that trainings from before there were codes can be resumed
         del shapes["code"]
-    identity = identity_of(train, dataset, target=shapes, tasks=tasks, views=dataset.views, **origin_of(init))
+    identity = fit.identity_of(train, dataset, target=shapes, tasks=tasks, views=dataset.views, **origin_of(init))
     begun = bool(command_to_go_on(database, "target", folder))
-    place = Destination(folder, identity, train.steps, "name", settings.replace, begun)
-    place.check()
+    place = fit.Destination(folder, identity, train.steps, "name", settings.replace, begun)
     start = f", starting from {init}" if init else ""
     text = (
-        f"{folder}: {settings.target.size} on {settings.target.observation}, "
+        f"{settings.target.size} on {settings.target.observation}, "
         f"{count(len(dataset.of_tasks(*tasks)), 'demonstration')} of {count(len(tasks), 'task')}, "
         f"{count(train.steps, 'step')} of {train.batch} samples{start}"
     )
-    training = TargetTraining(settings, dataset, tasks, world, init, place)
-    return Plan("target", folder, text, training.work, place.check, training.seconds)
+    return TargetTraining(settings, dataset, place, tasks, world, init).plan("target", text)
 
 
 def checked_demos(
@@ -367,7 +339,7 @@ class Imitation:
         with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16), sdpa_kernel(kernels):
             yield
 
-    def loss(self, indices: Tensor, step: int) -> tuple[Tensor, Metrics]:
+    def loss(self, indices: Tensor, step: int) -> tuple[Tensor, fit.Metrics]:
         """Return the loss of the samples `indices` (B,), and the metrics to log."""
         batch = self.training.where(indices)
         inputs = batch.inputs(self.device)
@@ -390,7 +362,7 @@ class Imitation:
         return loss, metrics
 
     @torch.no_grad()
-    def validate(self, module: nn.Module) -> Metrics:
+    def validate(self, module: nn.Module) -> fit.Metrics:
         """Return metrics on the held-out episodes, with teacher forcing.
 
         The score is minus the mean absolute error of the actions, plus ten times the closed-loop success if it is
