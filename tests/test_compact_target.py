@@ -23,7 +23,7 @@ from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early.drafter import EarlyDrafter
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.methods.unverified import ParallelPass
-from kerv_cli.targets.attention import CapturedCache, attention_mask, bucket
+from kerv_cli.targets.attention import SIZES, CapturedCache, attention_mask
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.features import WordTokenizer, places_of, privileged_features, scene_features, scene_width
 from kerv_cli.targets.compact.program import compile_parts
@@ -151,7 +151,7 @@ def test_an_observation_of_another_environment_is_refused():
         seeing.encode(Observation(np.zeros(8), np.zeros(14), "insert"))
 
 
-@pytest.mark.parametrize("tokens", [1, 3, 16, 17, 33])
+@pytest.mark.parametrize("tokens", [1, 3, 16, 17, 33, 65])
 def test_a_padded_bucket_computes_its_tokens(tokens):
     """What a captured graph would run, call by call: the rows behind the tokens change nothing."""
     torch.manual_seed(0)
@@ -159,13 +159,13 @@ def test_a_padded_bucket_computes_its_tokens(tokens):
     x, positions = torch.randn(1, 20 + tokens, 32), torch.arange(20 + tokens)
     with torch.inference_mode():
         uncached = trunk.run_layers(x, positions, None, None, None)[:, 20:]
-        cache = trunk.new_cache(1, 60, fixed=True)
+        cache = trunk.new_cache(1, 90, fixed=True)
         assert isinstance(cache, CapturedCache)
         for first, last in ((0, 20), (20, 20 + tokens)):
             mask = attention_mask(None, last - first, cache, x)
             in_buckets = cache.run(trunk.run_layers, x[:, first:last], positions[first:last], mask)
             cache.length = last
-    assert cache.steps.keys() == {32, bucket(tokens)}
+    assert cache.steps.keys() == set(SIZES)
     assert torch.allclose(in_buckets, uncached, atol=1e-5)
 
 

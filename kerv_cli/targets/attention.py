@@ -121,43 +121,30 @@ def attention_mask(seen: Seen, tokens: int, cache: Cache | None, like: Tensor) -
     cached, fixed = (cache.length, cache.fixed) if cache is not None else (0, False)
     stop = cached + tokens
     slots = cache.buffer.shape[-2] if cache is not None and fixed else stop
-    if isinstance(seen, Tensor):
-        mask = like.new_zeros(tokens, slots)
-        mask[:, stop - seen.shape[1] : stop].masked_fill_(~seen, -torch.inf)
-        mask[:, stop:] = -torch.inf
-        return mask
-    plain = (tokens == 1 or not cached) if seen is None else (tokens == 1 and seen.all())
-    if plain and not fixed:
-        return None
-    if seen is None:
-        seen = np.tri(tokens, dtype=bool)
-    rows = np.zeros((tokens, slots), dtype=np.float32)
-    rows[:, stop - seen.shape[1] : stop][~seen] = -np.inf
-    rows[:, stop:] = -np.inf
-    return upload(rows, like.device).to(like.dtype)
+    if not isinstance(seen, Tensor):
+        plain = (tokens == 1 or not cached) if seen is None else (tokens == 1 and seen.all())
+        if plain and not fixed:
+            return None
+        seen = upload(np.tri(tokens, dtype=bool) if seen is None else seen, like.device)
+    mask = like.new_zeros(tokens, slots)
+    mask[:, stop - seen.shape[1] : stop].masked_fill_(~seen, -torch.inf)
+    mask[:, stop:] = -torch.inf
+    return mask
 
 
 def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
     """Apply rotary position embedding.
 
     Args:
-        x: (B, T, heads, C) queries or keys, or (B, heads, T, C).
-        cos: Cosines of the positions, (T, 1, C) for the first shape of x, (T, C) for the second.
-        sin: Sines, in the shape of `cos`. In the first half of the channels their sign is reversed.
+        x: (B, T, heads, C) queries or keys.
+        cos: (T, 1, C) cosines of the positions.
+        sin: (T, 1, C) sines. In the first half of the channels their sign is reversed.
     """
     return torch.addcmul(x * cos, x.roll(x.shape[-1] // 2, -1), sin)
 
 
-_AT_ONCE = (1, 2, 4, 8, 16, 32, 64)  # sizes of the graphs that are captured at the first forward
+SIZES = (1, 2, 4, 8, 16, 32, 64)  # numbers of tokens for which graphs are captured, at the first forward of so few
 _WARM_UP = 3  # runs before a capture, in which libraries choose kernels and allocate workspaces
-
-
-def bucket(tokens: int) -> int:
-    """Return the size of the smallest CUDA graph for so many tokens: a power of two up to 16, then a multiple of 16."""
-    if tokens <= 16:
-        return 1 << (tokens - 1).bit_length()
-    return -(-tokens // 16) * 16
-
 
 # what a CUDA graph captures: `LayerStack.run_layers`
 Compute = Callable[[Tensor, Tensor, Cache, Tensor, Tensor], Tensor]
@@ -166,12 +153,13 @@ Compute = Callable[[Tensor, Tensor, Cache, Tensor, Tensor], Tensor]
 class CapturedCache(Cache):
     """A key/value cache of fixed shapes, with CUDA graphs that run a forward through all layers in one launch.
 
-    A graph takes a fixed number of tokens, called its bucket. A forward of T tokens runs in the smallest bucket that is
-    large enough. The bucket's unused tokens have zeros as input. Their keys and values go to the spare slot, which no
-    other token attends to. The batch size is 1. On a CPU the same computation runs without graphs, for tests.
+    A graph takes a fixed number of tokens, its size. A forward of T tokens runs in the smallest graph that is large
+    enough. The unused tokens have zeros as input. Their keys and values go to the spare slot, which no other token
+    attends to. A forward of more than 64 tokens, such as a long prompt, runs without a graph: to capture one in an
+    episode would count in its time. The batch size is 1. On a CPU the same computation runs without graphs, for tests.
 
     Attributes:
-        steps: The graphs, by number of tokens. Empty before the first forward on a GPU.
+        steps: The graphs, by number of tokens. Empty before the first forward of at most 64 tokens.
     """
 
     fixed = True
@@ -188,13 +176,12 @@ class CapturedCache(Cache):
             positions: (T,) rotary positions.
             mask: (T, slots) result of `attention_mask`.
         """
-        # captured now, in the warm-up: later a capture would count in an episode's time
-        if self.buffer.is_cuda and not self.steps:
-            self.steps = {size: _Step(compute, self, size, x.shape[2]) for size in _AT_ONCE if size <= self.capacity}
-        size = bucket(x.shape[1])
-        if size not in self.steps:
-            self.steps[size] = _Step(compute, self, size, x.shape[2])
-        return self.steps[size].run(x, positions, mask)
+        tokens = x.shape[1]
+        if tokens > SIZES[-1]:
+            slots = torch.arange(self.length, self.length + tokens, device=x.device)
+            return compute(x, positions, self, slots, mask)
+        self.steps = self.steps or {size: _Step(compute, self, size, x.shape[2]) for size in SIZES}
+        return self.steps[1 << (tokens - 1).bit_length()].run(x, positions, mask)
 
 
 class _Step:
