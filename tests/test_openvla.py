@@ -207,7 +207,7 @@ def test_the_crop_is_tensorflows(target):
 
 
 @pytest.mark.bits
-@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 10_000), nodes=st.integers(0, 24), inside=st.booleans(), fixed=st.booleans())
 def test_strict_decoding_equals_ar(target, monkeypatch, seed, nodes, inside, fixed):
     monkeypatch.setattr(target, "new_cache", lambda batch, size: OpenVLATarget.new_cache(target, batch, size, fixed))
@@ -305,19 +305,14 @@ def pickled(folder: Path) -> None:
     torch.save({"x": torch.zeros(1)}, folder / "pytorch_model.bin")
 
 
-def doubled(folder: Path) -> None:
-    shutil.copy(folder / "model-00001-of-00002.safetensors", folder / "other.safetensors")
-
-
 @pytest.mark.parametrize(
     ("harm", "said"),
     [
         (truncated, "cut short"),
-        (rewritten(lambda tensors: tensors.update(norm=tensors.pop(NORM))), f"1 missing: {NORM}; 1 unknown: norm"),
+        (rewritten(lambda tensors: tensors.update(norm=tensors.pop(NORM))), "2 are missing, unknown or of another"),
         (rewritten(lambda tensors: tensors[NORM].fill_(math.nan)), f"numbers in {NORM} that are not finite"),
         (pickled, "holds pickled weights (pytorch_model.bin)"),
         (lambda folder: (folder / "tokenizer.json").unlink(), "no tokenizer.json in"),
-        (doubled, "model-00001-of-00002.safetensors and other.safetensors in "),
     ],
 )
 def test_damaged_files_are_refused_in_one_line(checkpoint, tmp_path, harm, said):
