@@ -112,6 +112,7 @@ class Decoder(Follower):
         proposers = filter(None, (self.parts.prefill_draft, self.parts.proposer))
         nodes = max(size, *(proposer.nodes for proposer in proposers), 0)
         self.cache = target.new_cache(1, target.max_prompt + size + nodes + 1)
+        self.r = 0  # the acceptance radius of this decode, bins
         self.decodes = 0  # in this episode
         self.deviation_every = 0  # every this many decodes, measure the deviation from autoregressive actions; 0: never
 
@@ -184,7 +185,8 @@ class Decoder(Follower):
         self.cache.length, choice, boundary = 0, None, self.parts.boundary
         if boundary is not None:
             choice = boundary.choose(np.array(self.path))
-        limits = self.acceptance.limits(self.threshold.radius())
+        self.r = self.threshold.radius()
+        limits = self.acceptance.limits(self.r)
         target = TargetSide(prompt if callable(prompt) else lambda: prompt, self.cache)
         return Chunk(self.steps, self.space, self, target, limits, choice)
 
@@ -275,8 +277,8 @@ class Decoder(Follower):
     def accept(self, chunk: Chunk, verified: Verified, proposer: Proposer | None) -> Accepted:
         if proposer is None:
             return Accepted((), None)
-        rule, r = self.acceptance.of_drafts_from(proposer.name), self.threshold.radius()
-        path, rejected = rule.judge_after(chunk.tokens, verified.tree, verified.target_tokens, r)
+        rule = self.acceptance.of_drafts_from(proposer.name)
+        path, rejected = rule.judge_after(chunk.tokens, verified.tree, verified.target_tokens, self.r)
         kept = chunk.until_end([verified.tree.tokens[node] for node in path])
         ended = bool(kept) and kept[-1] == self.space.end
         return Accepted(path[: len(kept)], None if ended else rejected)
@@ -303,7 +305,7 @@ class Decoder(Follower):
             accepted=len(path),
             committed=len(path) + len(bonus),
             tree_size=len(tree),
-            threshold=self.acceptance.of_drafts_from(proposer.name).limits(self.threshold.radius()),
+            threshold=self.acceptance.of_drafts_from(proposer.name).limits(self.r),
             levels=verified.levels,
         )
         judged = Judged(tree, target_tokens, rejected)

@@ -168,8 +168,8 @@ def variability(rounds: Sequence[Round], space: ActionSpace, measure: str = MEAN
         return None
     drafted, targets, places = list[int](), list[int](), list[int]()
     for one in rounds:
-        count = one.accepted if measure.endswith("accepted") else len(one.drafted)
-        if one.mode != "skip":
+        if one.drafted and one.mode != "skip":
+            count = one.accepted if measure.endswith("accepted") else len(one.drafted)
             drafted += one.drafted[:count]
             targets += one.target_tokens[:count]
             places += range(one.start, one.start + count)
