@@ -88,7 +88,7 @@ class PolicyServer:
 
     def handle(self, connection: ServerConnection) -> None:
         """Serve one client until it disconnects. Runs in the client's thread."""
-        who = _address(connection)
+        who = str(connection.remote_address)
         if not self._seats.acquire(timeout=PATIENCE):
             count = self.protocol.seats
             full = "another client is being served" if count == 1 else f"{count} clients are served"
@@ -142,13 +142,6 @@ def _summary(times: list[float]) -> str:
         return "0 answers"
     p50, p95 = np.percentile(times, [50, 95])
     return f"{len(times)} answers, p50 {p50:.1f} p95 {p95:.1f} worst {max(times):.1f} ms"
-
-
-def _address(connection: ServerConnection) -> str:
-    try:
-        return str(connection.remote_address)
-    except OSError:
-        return "a client that has left"
 
 
 def _one_line_logger(log: Callable[[str], None]) -> logging.Logger:

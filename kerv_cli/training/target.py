@@ -100,7 +100,13 @@ def plan_target(settings: TrainTargetSettings, database: Database) -> Plan[tuple
     settle_places(settings, dataset)
     world = settled(settings.world, tasks)
     init = initial_target(settings, world.camera.name, folder)
-    dataset = checked_demos(settings, dataset, tasks, world.camera.name)
+    spec = spec_of(tasks[0])
+    check_spaces(dataset, spec.actions, spec.observation, f"the tasks' environment {spec.name}")
+    check_tasks(dataset, tasks)
+    if settings.target.observation == "vision":
+        dataset = seen_by(
+            dataset, world.camera.name, "the policy would be shown", "set world.camera.name, or record again"
+        )
     shapes = asdict(settings.target)
     if settings.target.code == "bins":  # left out, so that trainings from before there were codes can be resumed
         del shapes["code"]
@@ -114,18 +120,6 @@ def plan_target(settings: TrainTargetSettings, database: Database) -> Plan[tuple
         f"{count(train.steps, 'step')} of {train.batch} samples{start}"
     )
     return TargetTraining(settings, dataset, place, tasks, world, init).plan("target", text)
-
-
-def checked_demos(
-    settings: TrainTargetSettings, dataset: DemoDataset, tasks: tuple[str, ...], camera: str
-) -> DemoDataset:
-    """Check that demonstrations are of these tasks and show what the policy will see. Return those views of them."""
-    spec = spec_of(tasks[0])
-    check_spaces(dataset, spec.actions, spec.observation, f"the tasks' environment {spec.name}")
-    check_tasks(dataset, tasks)
-    if settings.target.observation != "vision":
-        return dataset
-    return seen_by(dataset, camera, "the policy would be shown", "set world.camera.name, or record again")
 
 
 def origin_of(init: Path | None) -> dict[str, str]:
