@@ -164,7 +164,7 @@ def assert_same(
 
 
 @pytest.mark.bits
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(
     space=st.sampled_from([SEVEN, SPEC.actions, space_of(1, 2), space_of(5), None]),
     seed=st.integers(0, 10_000),

@@ -18,7 +18,7 @@ from loaded import datastore_of
 from mock_target import SEVEN
 from test_calibration import write_dataset
 
-from kerv_cli.base.errors import CheckpointError, StorageError, UnknownName, UsageError
+from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
 from kerv_cli.base.manifests import DIGEST
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decisions import ROOT, TokenTree
@@ -26,7 +26,6 @@ from kerv_cli.lab.database import Database
 from kerv_cli.methods.heisd.datastore import Datastore, Shard, check_seeds, neighbour_tree, prompt_key
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.checkpoint import TargetDescription, load_target
-from kerv_cli.training import datastore as datastore_build
 from kerv_cli.training.datastore import plan_datastore
 from kerv_cli.training.settings import BuildDatastoreSettings
 from kerv_cli.worlds.demos.files import DemoEpisode
@@ -325,44 +324,6 @@ def test_demonstrations_that_do_not_fit_the_target_are_refused(copy):
     with pytest.raises(CheckpointError, match="32 x 32 pixels, the policy takes 96"):
         build(asked(copy, "nano-vision"))
     assert opened(copy)[0].manifest.rows == 52  # what was there still is
-
-
-def test_only_a_datastore_is_ever_replaced(copy):
-    other = copy / "artifacts/datastore/other"
-    other.mkdir()
-    assert build(asked(copy, named="other"))[0] == other
-    shutil.rmtree(other)
-    other.mkdir()
-    (other / "thesis.tex").write_text("years of work")
-    with pytest.raises(UsageError, match="is there already"):
-        build(asked(copy, named="other", replace=False))
-    with pytest.raises(UsageError):
-        build(asked(copy, named=str(copy / "artifacts/target/nano-state")))
-
-
-def refusing(real: Callable[..., Any]) -> Callable[..., Any]:
-    """Does its work, then finds the disk full."""
-
-    def failing(*arguments, **options):
-        real(*arguments, **options)
-        raise OSError(28, "No space left on device")
-
-    return failing
-
-
-@pytest.mark.parametrize("stage", ["write_files", "write_json", "sha256_of"])
-@pytest.mark.parametrize("before", [True, False])
-def test_a_build_that_fails_leaves_what_was_there(copy, monkeypatch, stage, before):
-    if not before:
-        shutil.rmtree(folder_of(copy))
-    parent = folder_of(copy).parent
-    names = sorted(p.name for p in parent.iterdir())
-    monkeypatch.setattr(datastore_build, stage, refusing(getattr(datastore_build, stage)))
-    with pytest.raises(StorageError):
-        build(asked(copy, episodes=1))
-    assert sorted(p.name for p in parent.iterdir()) == names
-    if before:
-        assert opened(copy)[0].manifest.rows == 52
 
 
 @pytest.mark.bits

@@ -133,7 +133,7 @@ def assert_adds_up(chunk: Chunk) -> None:
         start += r.committed
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(
     seed=st.integers(0, 10_000),
     layers=st.integers(1, 3),
@@ -261,7 +261,7 @@ def spaces(draw: st.DrawFn) -> ActionSpace:
     return dataclasses.replace(space_of(*sizes), bins=draw(st.integers(3, 40)))
 
 
-@settings(max_examples=80)
+@settings(max_examples=25)
 @given(
     seed=st.integers(0, 10_000),
     actions=spaces(),
@@ -283,7 +283,7 @@ def test_any_target_is_decoded_losslessly(seed, actions, chunk, words, nodes, in
     assert_adds_up(result)
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(
     seed=st.integers(0, 10_000),
     actions=spaces(),

@@ -38,7 +38,7 @@ PLACES = {
 
 
 @pytest.mark.bits
-@settings(max_examples=25)
+@settings(max_examples=8)
 @given(seed=st.integers(0, 10_000), chunk=st.sampled_from([1, 2, 4]), depth=st.integers(0, 20), data=st.data())
 @pytest.mark.parametrize("place", ["proposer", "prefill_draft", "merged"])
 @pytest.mark.parametrize("mock", [True, False])

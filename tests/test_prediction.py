@@ -95,12 +95,6 @@ def test_further_steps_are_predicted_from_the_accepted_prefix():
     assert actions[1:, 3] == pytest.approx(first[3])
 
 
-def test_without_enough_history_the_target_decodes_on():
-    chunk = chunk_with(follower_of())
-    chunk.tokens = [1, 2]
-    assert compensation().rectify(chunk) is None
-
-
 def test_the_filter_rests_after_a_compensation():
     resting = compensation(rest=2)
     closed = []
@@ -332,14 +326,6 @@ def test_predictions_are_bounded_and_held_dofs_keep_their_last_value(kind, histo
     moving = np.logical_not(held)
     free = predictor(kind, (False,) * DOFS).predict(history, steps)
     assert (ahead[:, moving] == free[:, moving]).all()
-
-
-@pytest.mark.parametrize("kind", PREDICTORS)
-def test_a_short_history_gives_no_prediction(kind):
-    built = predictor(kind, minimum=5)
-    assert built.predict(np.zeros((4, DOFS)), 1) is None
-    assert built.predict(np.zeros((0, DOFS)), 1) is None
-    assert built.predict(np.zeros((5, DOFS)), 1) is not None
 
 
 def test_the_history_keeps_the_newest():

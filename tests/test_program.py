@@ -20,7 +20,7 @@ from kerv_cli.targets.checkpoint import compact, expanded
 from kerv_cli.targets.compact import program
 from kerv_cli.targets.compact.features import WordTokenizer
 from kerv_cli.targets.compact.program import Program, compile_parts, kernels, multiplies_bfloat16, own_folder
-from kerv_cli.targets.compact.target import CompactTarget, Inputs
+from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import Trunk
 from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.worlds.metaworld.spec import SPEC
@@ -137,7 +137,7 @@ def test_the_packed_trunk_is_the_trunk(seed, layers, heads, channels, prompt, no
     assert torch.equal(x, before)  # the caller's tensor is left alone
 
 
-@settings(max_examples=10)
+@settings(max_examples=4)
 @given(
     seed=st.integers(0, 10_000),
     grid=st.sampled_from([1, 2, 3]),
@@ -159,29 +159,6 @@ def test_the_packed_prompt_is_the_prompt(seed, grid, keypoints, channels, norm, 
         a, b = (t.encode_batch(t.inputs(shown)) for t in (plain, compiled))
     assert close(a[0], b[0])
     assert close(a[1], b[1])
-
-
-def test_a_sharp_temperature_does_not_overflow():
-    plain, compiled = both_targets("vision", 3)
-    for target in (plain, compiled):
-        target.vision.temperature.data.fill_(1e4)
-    compile_parts(compiled)
-    images = torch.randint(0, 256, (1, 3, 48, 48), dtype=torch.uint8)
-    with torch.inference_mode():
-        points = compiled.vision(images)[1]
-        assert torch.isfinite(points).all()
-        assert torch.allclose(points, plain.vision(images)[1], atol=1e-2)
-
-
-@pytest.mark.parametrize("observation", ["vision", "state"])
-def test_batches_and_teacher_forcing_agree(observation):
-    plain, compiled = both_targets(observation, 5)
-    images = torch.randint(0, 256, (3, 3, 48, 48), dtype=torch.uint8) if observation == "vision" else None
-    words = torch.ones(3, plain.settings.instruction_tokens).long()
-    inputs = Inputs(images, torch.randn(3, 4) * 0.1, torch.randn(3, 39) * 0.1, words)
-    tokens = torch.randint(0, ACTIONS.tokens, (3, plain.chunk * ACTIONS.dofs))
-    with torch.inference_mode():
-        assert close(plain.teacher_forced(inputs, tokens)[0], compiled.teacher_forced(inputs, tokens)[0])
 
 
 @pytest.mark.parametrize("final_norm", [True, False])
@@ -299,7 +276,7 @@ def test_what_trains_is_not_packed_and_gets_its_gradients():
 
 
 def test_plain_decoders_in_numpy_and_c_give_the_shipped_policys_tokens(tmp_path):
-    assert plain_decoder.main("mt10-vision", 100, tmp_path)
+    assert plain_decoder.main("mt10-vision", 20, tmp_path)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -116,15 +116,6 @@ def test_what_sleeps_is_in_the_clock_in_its_phase(slow, phase):
     assert all(min(r.phases[name] for r in records) < PAUSE for name in others)
 
 
-def test_a_merged_draft_goes_unverified_as_its_first_chain():
-    target = MockTarget()
-    prompt = target.encode(SHOWN)
-    first, second = Near(target, prompt, bins=1), Near(target, prompt)
-    merged = MergedProposer([first, second], 40)
-    record = Decoder(target, Parts(prefill_draft=merged, skip=AlwaysSkip(merged))).decode(SHOWN)
-    assert (record.forwards, list(record.tokens)) == (0, first.drafted)
-
-
 # --- skip=always
 
 
@@ -256,16 +247,6 @@ def test_a_disagreement_ends_the_streak_and_counting_begins_anew():
     assert modes(decoder, 3) == "vvv"
     source.drafted = good
     assert modes(decoder, 5) == "vsvss"
-
-
-@torch.inference_mode()
-def test_an_episode_begins_with_a_verification():
-    target = MockTarget()
-    decoder = decoder_of(near(target), target)
-    assert modes(decoder, 4) == "vsvs"
-    decoder.finish(True)
-    decoder.reset("t", 1, np.zeros(3))
-    assert modes(decoder, 3) == "vsv"
 
 
 class ByPlace(MockTarget):

@@ -255,21 +255,6 @@ def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results
 
 
 @pytest.mark.usefixtures("quick_training")
-def test_training_counts_subnormal_numbers_as_zero_and_this_thread_nothing_later(results, monkeypatch):
-    halves, loss = [], Imitation.loss
-
-    def watched(*given):
-        halves.append(float(torch.tensor(1e-39) * 0.5))
-        return loss(*given)
-
-    monkeypatch.setattr(Imitation, "loss", watched)
-    words = ["target=nano", "task=drawer-close", "train.batch=2", "train.steps=2", "train.validate_every=2"]
-    kerv("train", "target", "name=flushed", *words, "demos=few", f"results={results}")
-    assert halves == [0.0, 0.0]
-    assert float(torch.tensor(1e-39) * 0.5) > 0
-
-
-@pytest.mark.usefixtures("quick_training")
 def test_a_run_learns_the_experts_own_path(results):
     words = ["target=nano", "train=plain", "task=drawer-close", "train.batch=2", "train.steps=3"]
     out = train(results, "target", "name=path", *words, "train.validate_every=3")
