@@ -164,7 +164,7 @@ def _profile_latency(settings: RolloutSettings, target: TargetDescription | None
     except CheckpointError as error:
         raise UsageError(f"rollout.profile={name}: {error}") from error
     method = Method.of(settings)
-    costs = method.prefill_draft.cost, method.proposer.cost
+    costs = method.parts["prefill_draft"].cost, method.parts["proposer"].cost
     drafter = (DRAFTING, "feed") if DRAFTING in costs else ()
     if lacks := profile.lacks(("encode", "prefill", "verify", *drafter)):
         raise UsageError(f"rollout.profile={name}: {path} has no phase '{lacks[0]}', which this method needs")

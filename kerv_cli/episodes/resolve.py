@@ -270,7 +270,8 @@ def idle_keys(settings: RolloutSettings) -> dict[str, str]:
         unused = {f"world.camera.{name}": reason for name, reason in drawn.items() if pixels}
         return unused | ({"method": "the server decides it"} if settings.policy.kind == REMOTE else {})
     method, timing, batch = Method.of(settings), settings.rollout, settings.rollout.batch
-    draft, proposer, skip, needed = method.prefill_draft, method.proposer, method.skip, set(method.needs)
+    draft, proposer, skip = (method.parts[kind] for kind in ("prefill_draft", "proposer", "skip"))
+    needed = set(method.needs)
     acceptance = AcceptancePart.find(settings.acceptance.kind)
     idle: dict[str, str] = {}
     if proposer.absent and draft.absent:

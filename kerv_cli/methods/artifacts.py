@@ -75,21 +75,16 @@ class Artifact(Generic[T]):
         noun: Name of the kind in messages, such as `early drafter`.
         made: Word that messages use for how such an artifact was made, such as `trained`.
         command: Command-line arguments after `kerv` that make such an artifact. Empty if no command makes it.
-        advice: Words that messages write before this command.
     """
 
     kind: str
     noun: str
     made = "trained"
     command: tuple[str, ...] = ()
-    advice = "run"
     schema: type[T]
 
     def again(self, *words: str) -> str:
-        return f"{self.advice} 'kerv {' '.join((*self.command, *words))}'"
-
-    def anew(self, *words: str) -> str:
-        return self.again(*words, "replace=true")
+        return f"run 'kerv {' '.join((*self.command, *words))}'"
 
     def path(self, results: str, name: str | None, target: Path) -> Path:
         return artifact_or_path(results, self.kind, name) if name else beside(target, self.kind)
@@ -138,7 +133,7 @@ class Artifact(Generic[T]):
     def checked(self, path: Path, target: TargetDescription) -> T:
         """Read the description of the artifact in `path`, and check that it was made for this target."""
         description = self.read(path)
-        made, what, again = self.made_for(description), f"the {self.noun} in {path}", self.anew()
+        made, what, again = self.made_for(description), f"the {self.noun} in {path}", self.again("replace=true")
         made.actions.check_same(target.actions, what, "the target", statistics=True)
         what = f"{what} was {self.made}"
         if made.chunk and made.chunk != target.chunk:
@@ -184,6 +179,8 @@ class Artifacts:
     def check(self, kinds: Iterable[str], use: Use | None = None) -> dict[str, str]:
         """Check artifacts without loading weights. Return the hashes, by kind, of the target and of these artifacts."""
         hashes, sources = {TARGET: self.description.sha256}, []
+        named = (f"policy.artifacts.{kind}={name}" for kind, name in self.policy.artifacts.items() if name)
+        words = [f"policy.target={self.policy.target}", *named, "replace=true"]
         for kind in dict.fromkeys(kinds):
             files, path = kind_of(kind), self.path(kind)
             if files.command and not self.exists(kind):
@@ -191,19 +188,12 @@ class Artifacts:
             description = files.checked(path, self.description)
             hashes[kind] = files.digest(path, description)
             what = f"the {files.noun} in {path} was {files.made}"
-            sources.append((files.sources(description), what, self._again(files)))
+            sources.append((files.sources(description), what, files.again(*words)))
             if use is not None:
                 files.check_use(description, use)
         for hashes_of_sources, what, again in sources:
             check_sources(hashes_of_sources, hashes, what, again)
         return hashes
-
-    def _again(self, files: Artifact[Any]) -> str:
-        words = [f"policy.target={self.policy.target}"]
-        for kind, name in self.policy.artifacts.items():
-            if name:
-                words.append(f"policy.artifacts.{kind}={name}")
-        return files.anew(*words)
 
     def _making(self, files: Artifact[Any]) -> str:
         target, name = f"policy.target={self.policy.target}", self.policy.artifacts.get(files.kind)

@@ -38,7 +38,7 @@ class Method:
         return cls(settings.parts(), settings.chunk, settings.method)
 
     @functools.cached_property
-    def parts(self) -> dict[str, registry.Part]:
+    def parts(self) -> dict[str, Any]:
         return {kind: registry.part_of(kind, self.settings[kind].kind) for kind in registry.METHOD_KINDS}
 
     @property
@@ -47,18 +47,6 @@ class Method:
         for kind, part in self.parts.items():
             kinds += part.needed(self.settings[kind])
         return tuple(dict.fromkeys(kinds))
-
-    @property
-    def prefill_draft(self) -> registry.ProposerPart:
-        return registry.ProposerPart.find(self.settings["prefill_draft"].kind, "prefill_draft.kind")
-
-    @property
-    def proposer(self) -> registry.ProposerPart:
-        return registry.ProposerPart.find(self.settings["proposer"].kind, "proposer.kind")
-
-    @property
-    def skip(self) -> registry.SkipPart:
-        return registry.SkipPart.find(self.settings["skip"].kind, "skip.kind")
 
     def check(self, target: Target | TargetDescription, batch: int = 1) -> None:
         """Refuse parts that do not work together or with the target, and numbers out of range. Loads no weights."""
@@ -69,12 +57,13 @@ class Method:
         chunk_steps(self.chunk, target.chunk)
         for kind, part in self.parts.items():
             part.check_code(kind, bool(target.actions.code))
+        draft, proposer, skip, boundary = (
+            self.parts[kind] for kind in ("prefill_draft", "proposer", "skip", "boundary")
+        )
         threshold, most = self.settings["threshold"], target.actions.tokens - 1
-        name = registry.ThresholdPart.find(threshold.kind).radius
+        name = self.parts["threshold"].radius
         if name and getattr(threshold, name) > most:
             raise UsageError(f"threshold.{name}={getattr(threshold, name)}: bins from 0 to {most}")
-        proposer, draft, skip = self.proposer, self.prefill_draft, self.skip
-        boundary = registry.BoundaryPart.find(self.settings["boundary"].kind)
         if proposer.has_boundary != boundary.chooses:
             raise UsageError(
                 f"proposer={proposer.name} with boundary={boundary.name}: "
@@ -105,10 +94,9 @@ class Method:
             self._check_batch(batch)
 
     def _check_batch(self, batch: int) -> None:
-        draft, skip = self.prefill_draft, self.skip
-        threshold = registry.ThresholdPart.find(self.settings["threshold"].kind)
+        draft, skip, threshold = (self.parts[kind] for kind in ("prefill_draft", "skip", "threshold"))
         is_used = draft.absent or skip.takes_draft
-        if not (self.proposer.absent and self.parts["boundary"].absent and skip.batchable and is_used):
+        if not (self.parts["proposer"].absent and self.parts["boundary"].absent and skip.batchable and is_used):
             raise UsageError(
                 f"rollout.batch={batch}: method={self.name} decodes one episode at a time. Leave rollout.batch out"
             )

@@ -233,7 +233,7 @@ class DatastoreArtifact(Artifact[Manifest]):
     """Finds, checks and loads datastores."""
 
     kind = noun = "datastore"
-    made, command, advice = "built", ("build", "datastore"), "build one with"
+    made, command = "built", ("build", "datastore")
     schema = Manifest
 
     def json(self, path: Path) -> Path:
