@@ -16,13 +16,10 @@ PACKAGES = ("kerv", "torch", "metaworld", "mujoco", "numpy", "onnxruntime")
 _HERE = Path(__file__).resolve().parent
 
 
-def provenance(device: str) -> dict[str, Any]:
-    return {"versions": versions(), "git_commit": git_commit(), "device": device, "device_name": device_name(device)}
-
-
 def provenance_of(command: str, settings: Any, device: str, **figures: Any) -> dict[str, Any]:
     """Return the whole provenance of an artifact: command, settings, figures, versions, commit and device."""
-    return {"command": command, "settings": asdict(settings), **figures, **provenance(device)}
+    made = {"versions": versions(), "git_commit": git_commit(), "device": device, "device_name": device_name(device)}
+    return {"command": command, "settings": asdict(settings), **figures, **made}
 
 
 def stamp(device: str) -> dict[str, str]:

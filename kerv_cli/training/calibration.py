@@ -82,12 +82,12 @@ class CalibrationWork:
         with stage("boundary ranges") as progress:
             boundary = fit_boundary(paths, settings.boundary_windows, progress)
         with stage("fitting the predictors"):
-            noise = fit_filters(past, future)
+            ratios = tuple(fit_noise(past[..., dof], future[..., dof]) for dof in range(past.shape[2]))
         calibration = stored.Calibration(
             target=MadeFor.of(target),
             demos=stored.Demonstrations(dataset.sha256, counts),
             window=settings.window,
-            noise=noise,
+            noise={"kalman": Noise(ratios, (1.0,) * len(ratios))},
             variability=variability,
             boundary=boundary,
             skip=skip,
@@ -294,11 +294,6 @@ def fit_noise(past: np.ndarray, future: np.ndarray) -> float:
         return float(np.abs(np.clip(past @ weights.T, -1.0, 1.0) - future).mean())
 
     return min(map(float, RATIOS), key=error)
-
-
-def fit_filters(past: np.ndarray, future: np.ndarray) -> dict[str, Noise]:
-    ratios = tuple(fit_noise(past[..., dof], future[..., dof]) for dof in range(past.shape[2]))
-    return {"kalman": Noise(ratios, (1.0,) * len(ratios))}
 
 
 @dataclass(frozen=True)
