@@ -17,9 +17,9 @@ def main() -> None:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _interrupt)
     sys.unraisablehook = _unraisable
-    from kerv_cli.cli.app import app
+    from kerv_cli.cli.app import program
 
-    app()
+    program.main()
 
 
 _is_interrupted = False

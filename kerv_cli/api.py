@@ -23,10 +23,10 @@ from kerv_cli.catalogue.entries import RunEntry, find_run, find_runs, matching, 
 from kerv_cli.episodes.resolve import resolve, resolve_rollout, study_name
 from kerv_cli.lab.command import chosen_store
 from kerv_cli.lab.database import opened
-from kerv_cli.lab.follow import run
 from kerv_cli.lab.store import ROLLOUT
 from kerv_cli.lab.store import Study as StoredStudy
 from kerv_cli.lab.study import check, plan
+from kerv_cli.lab.workers import run
 from kerv_cli.report.measures import Row
 from kerv_cli.report.report import report as write_reports
 from kerv_cli.report.tables import load_study as load_data

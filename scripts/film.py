@@ -19,8 +19,7 @@ from PIL import Image, ImageDraw, ImageFont
 from kerv_cli.board.episode import record_episode
 from kerv_cli.catalogue.episodes import find_episode, outcomes
 from kerv_cli.lab.database import opened
-from kerv_cli.lab.read import loaded
-from kerv_cli.lab.store import Study
+from kerv_cli.lab.store import Study, loaded
 from kerv_cli.report.viewing.token_outcomes import OUTCOMES, TokenOutcome, chunk_size, outcomes_of
 from kerv_cli.report.viewing.viewer import film_of
 

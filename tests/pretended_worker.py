@@ -7,10 +7,10 @@ import os
 
 import studies_synthetic
 
-from kerv_cli.lab import presence, work
+from kerv_cli.lab import runs, work
 
 work.EpisodeRunner = lambda *_: getattr(studies_synthetic, os.environ["PRETENDED"])
 work.checked = lambda *_: None  # the weights are pretended, too
 work.POLL_SECONDS = 0.05
-presence.LAPSE_SECONDS = float(os.environ.get("LAPSE", "30"))
-presence.BEAT_SECONDS = min(presence.BEAT_SECONDS, presence.LAPSE_SECONDS / 6)
+runs.LAPSE_SECONDS = float(os.environ.get("LAPSE", "30"))
+runs.BEAT_SECONDS = min(runs.BEAT_SECONDS, runs.LAPSE_SECONDS / 6)

@@ -22,12 +22,11 @@ from kerv_cli.engine.record import DecodeRecord, EpisodeRecord, Round
 from kerv_cli.episodes.identity import Setting, without
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database, opened
-from kerv_cli.lab.follow import Outcome, begun, follow
 from kerv_cli.lab.plan import all_episodes
 from kerv_cli.lab.store import Study
 from kerv_cli.lab.study import Plan, plan_study, save
-from kerv_cli.lab.work import OnEvent, Prepare, RunEpisode
-from kerv_cli.lab.workers import workers
+from kerv_cli.lab.work import OnEvent, Outcome, Prepare, RunEpisode, follow
+from kerv_cli.lab.workers import begun, workers
 from kerv_cli.worlds import settled
 from kerv_cli.worlds.metaworld.spec import SPEC
 

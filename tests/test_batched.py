@@ -29,8 +29,7 @@ from kerv_cli.episodes.cost import Profile
 from kerv_cli.episodes.identity import Setting
 from kerv_cli.episodes.runner import Request, run_together
 from kerv_cli.lab.plan import Episode, blocks_of
-from kerv_cli.lab.read import frame_of
-from kerv_cli.lab.store import Study
+from kerv_cli.lab.store import Study, frame_of
 from kerv_cli.lab.work import EpisodeRunner, RunEpisode
 from kerv_cli.methods.early import EarlySettings
 from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer

@@ -21,9 +21,8 @@ from kerv_cli.board import runs
 from kerv_cli.board.app import make_app
 from kerv_cli.episodes.rows import episode_row, seconds_blob
 from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, SETTINGS, WANTED, now, opened
-from kerv_cli.lab.read import counts_of
 from kerv_cli.lab.runs import Run
-from kerv_cli.lab.store import Study
+from kerv_cli.lab.store import Study, counts_of
 from kerv_cli.lab.study import save
 
 HERE = "http://127.0.0.1"

@@ -31,8 +31,7 @@ from kerv_cli.episodes.resolve import resolve_rollout
 from kerv_cli.episodes.rows import decode_records, decodes_table
 from kerv_cli.episodes.runner import Runner, close_worlds
 from kerv_cli.lab.database import WANTED, Database, opened
-from kerv_cli.lab.read import frame_of, studies
-from kerv_cli.lab.store import remove_study
+from kerv_cli.lab.store import frame_of, remove_study, studies
 from kerv_cli.report.viewing.token_outcomes import outcomes_of, tokens_hash
 
 expect.set_options(timeout=120_000)

@@ -22,8 +22,7 @@ from kerv_cli.episodes.interface import read_interface
 from kerv_cli.episodes.resolve import resolve
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import opened
-from kerv_cli.lab.read import how_to_run
-from kerv_cli.lab.store import Study
+from kerv_cli.lab.store import Study, how_to_run
 from kerv_cli.methods.compose import Method
 from kerv_cli.training.preparation import needs
 from kerv_cli.worlds.libero.spec import SPEC as LIBERO

@@ -24,9 +24,8 @@ from kerv_cli.episodes.rows import decodes_table, episode_row
 from kerv_cli.lab import database as module
 from kerv_cli.lab.command import STORE, noted, without_passwords
 from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, FILE, RUNS, STUDIES, WANTED, Database, Unanswered, opened
-from kerv_cli.lab.read import counts_of, decodes_of, frame_of, loaded, studies, version_of
 from kerv_cli.lab.runs import Run, making, pulse, run_rows, time_left
-from kerv_cli.lab.store import Study, remove_study
+from kerv_cli.lab.store import Study, counts_of, decodes_of, frame_of, loaded, remove_study, studies, version_of
 from kerv_cli.training.demonstrations import open_demos
 
 STUDY = threshold_study(["reach-v3"])
@@ -149,12 +148,15 @@ def test_a_kill_in_a_transaction_leaves_nothing(database, tmp_path):
 
 @pytest.mark.parametrize(
     ("schema", "message"),
-    [(0, "newer kerv"), (99, "of kerv 1.0 (schema 2, this one reads 99): choose another folder with results=")],
+    [
+        ("1", "schema 2, this one reads 1"),
+        ("99", "of another kerv (schema 2, this one reads 99): choose another folder"),
+    ],
 )
 def test_tables_of_another_kerv_are_refused(database, monkeypatch, schema, message):
     begun(database, "a")
-    monkeypatch.setattr(module, "SCHEMA", schema)
-    with refused(message, error=CheckpointError):
+    monkeypatch.setattr(module, "SCHEMA", "99")
+    with refused("of another kerv (schema 2, this one reads 99): choose another folder", error=CheckpointError):
         studies(opened(database.results))
     with pytest.raises(CheckpointError):
         begun(opened(database.results), "b")
@@ -314,7 +316,7 @@ def test_a_full_disk_keeps_what_was_committed(tmp_path, monkeypatch):
     store = Study(opened(tmp_path), "threshold")
     assert counts_of(store) == (8, 40)
     assert len(frame_of(store)) == 8
-    monkeypatch.setattr("kerv_cli.lab.presence.LAPSE_SECONDS", 1.0)
+    monkeypatch.setattr("kerv_cli.lab.runs.LAPSE_SECONDS", 1.0)
     swept(tmp_path, study)  # in this process, whose claim could not be released
     assert counts_of(store) == (40, 40)
 
@@ -340,11 +342,11 @@ def test_a_removed_study_leaves_nothing_but_what_others_want(database):
 
 
 def test_a_run_has_a_row_from_its_first_second_to_its_end(database, monkeypatch):
-    monkeypatch.setattr("kerv_cli.lab.presence.BEAT_SECONDS", 0.05)
+    monkeypatch.setattr("kerv_cli.lab.runs.BEAT_SECONDS", 0.05)
 
     def row():
         (row,) = run_rows(database, "target", "mine")
-        assert row.command == ("train", "target")
+        assert row.command == ["train", "target"]
         return row.status, row.done, row.total, row.message
 
     with Run(database, "target", "mine", ["train", "target"], total=9) as record:

@@ -38,12 +38,10 @@ from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.cli.common import progress_bar
 from kerv_cli.cli.studies import event_printer
 from kerv_cli.lab.database import EPISODES, UNFINISHED, WANTED, WORKERS, Database, clock, opened
-from kerv_cli.lab.follow import TimeLeft, begun
 from kerv_cli.lab.plan import blocks_of
-from kerv_cli.lab.presence import Presence
 from kerv_cli.lab.queue import MOST_DEATHS, ClaimLost, Queue
-from kerv_cli.lab.read import counts_of, frame_of
-from kerv_cli.lab.store import Study, remove_study
+from kerv_cli.lab.runs import Presence
+from kerv_cli.lab.store import Study, counts_of, frame_of, remove_study
 from kerv_cli.lab.study import save
 from kerv_cli.lab.work import (
     BlockStarted,
@@ -52,10 +50,9 @@ from kerv_cli.lab.work import (
     Event,
     Preparing,
     SettingFailed,
-    Started,
     work,
 )
-from kerv_cli.lab.workers import LocalWorkers, gpus_in_turn, workers
+from kerv_cli.lab.workers import LocalWorkers, TimeLeft, begun, gpus_in_turn, workers
 from kerv_cli.report.report import further_of
 from kerv_cli.report.tables import load_study
 from kerv_cli.worlds import EnvironmentPart
@@ -69,7 +66,7 @@ TWO = threshold_study(["reach-v3", "push-v3"])
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     monkeypatch.setattr("kerv_cli.lab.work.POLL_SECONDS", 0.05)
-    monkeypatch.setattr("kerv_cli.lab.follow.FOLLOW_SECONDS", 0.1)
+    monkeypatch.setattr("kerv_cli.lab.work.FOLLOW_SECONDS", 0.1)
 
 
 def queued(database: Database) -> int:
@@ -292,8 +289,8 @@ SWEEP = """
 import os
 import sys
 import studies_synthetic as s
-from kerv_cli.lab import follow, work
-work.POLL_SECONDS, follow.FOLLOW_SECONDS = 0.05, 0.1
+from kerv_cli.lab import work
+work.POLL_SECONDS, work.FOLLOW_SECONDS = 0.05, 0.1
 number, processes, rerun, *tasks = int(sys.argv[3]), int(sys.argv[4]), *sys.argv[5:]
 study = s.threshold_study(tasks or ["reach-v3", "push-v3"], **({} if tasks else {"episodes": 2, "radii": (3,)}))
 children = []
@@ -325,7 +322,7 @@ def test_workers_of_a_killed_sweep_end_and_the_next_one_begins_at_once(tmp_path)
 
 def test_an_episode_takes_one_transaction(tmp_path, monkeypatch):
     """Nor is SQLite's log flushed to the disk after each."""
-    monkeypatch.setattr("kerv_cli.lab.presence.BEAT_SECONDS", 60.0)
+    monkeypatch.setattr("kerv_cli.lab.runs.BEAT_SECONDS", 60.0)
     store, begun = waiting(Database(tmp_path), STUDY), []
     writing = Database.writing
     monkeypatch.setattr(Database, "writing", lambda self: begun.append(1) or writing(self))
@@ -370,7 +367,7 @@ def test_a_claim_lasts_as_long_as_its_heartbeat(database, silent, is_held, monke
 
 
 def test_a_worker_that_was_silent_did_not_die_in_its_episode(database, present, monkeypatch):
-    monkeypatch.setattr("kerv_cli.lab.presence.BEAT_SECONDS", 1000.0)
+    monkeypatch.setattr("kerv_cli.lab.runs.BEAT_SECONDS", 1000.0)
     store, late = waiting(database, STUDY), []
 
     def taken(setting, task):
@@ -408,19 +405,19 @@ def test_no_two_workers_run_an_episode_that_two_studies_share(database, present)
 STOPS = """
 import sys
 import studies_synthetic as s
-from kerv_cli.lab import presence, work
+from kerv_cli.lab import runs, work
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.queue import Queue
 from kerv_cli.lab.store import Study
-presence.LAPSE_SECONDS, presence.BEAT_SECONDS = 1.0, 0.3
-with presence.Presence(opened(sys.argv[1])) as here:
+runs.LAPSE_SECONDS, runs.BEAT_SECONDS = 1.0, 0.3
+with runs.Presence(opened(sys.argv[1])) as here:
     work.work(Queue(Study(opened(sys.argv[1]), "threshold"), here.worker), s.stops)
 """
 
 
 @pytest.mark.parametrize("is_taken", [True, False])
 def test_a_worker_that_was_stopped_writes_nothing_twice(database, monkeypatch, is_taken):
-    monkeypatch.setattr("kerv_cli.lab.presence.LAPSE_SECONDS", 1.0)
+    monkeypatch.setattr("kerv_cli.lab.runs.LAPSE_SECONDS", 1.0)
     store = waiting(database, STUDY)
     with python(STOPS, database.results) as process:
         until(lambda: running(database) == [100_002])
@@ -442,9 +439,9 @@ CREW = """
 import os
 import sys
 import studies_synthetic as s
-from kerv_cli.lab import database, follow, work
+from kerv_cli.lab import database, work
 from kerv_cli.lab.database import Database, opened
-from kerv_cli.lab.presence import Presence, bury
+from kerv_cli.lab.runs import Presence, bury
 from kerv_cli.lab.queue import Queue
 from kerv_cli.lab.store import Study
 from kerv_cli.lab.study import save
@@ -634,13 +631,14 @@ def test_progress_without_a_terminal_is_plain_lines(tmp_path, capsys):
     swept(tmp_path, threshold_study(["reach-v3"], episodes=1))
     with progress_bar("episodes") as show:
         bad = raising(ValueError("[bold] is not markup"), "naive_sd")
-        swept(tmp_path, STUDY, bad, on_event=event_printer(show))
+        left = TimeLeft(planned(opened(tmp_path), STUDY), 1.0)
+        swept(tmp_path, STUDY, bad, on_event=event_printer(show, left))
     written = capsys.readouterr().err
     lines = written.splitlines()
-    assert lines[0] == "4 episodes there already"
+    assert lines[0].startswith("4 episodes there already, 12 to run, about ")
     assert any(line.startswith("naive_sd on reach-v3: failed: ValueError: [bold] is not markup") for line in lines)
     assert re.fullmatch(r"12/12 .* on reach-v3, seed 100003: (success|failure), \d\.\d s", lines[-2])
-    assert re.fullmatch(r"episodes 12/12, reach-v3 100001-100003: 4 settings in turn", lines[-1])
+    assert re.fullmatch(r"episodes 12/12, about .* left, reach-v3 100001-100003: 4 settings in turn", lines[-1])
     assert "\x1b" not in written
 
 
@@ -650,7 +648,7 @@ def test_progress_begins_before_the_first_episode(tmp_path, capsys):
     (block, *_), setting = plan.blocks, study.settings[0]
     with progress_bar("episodes", has_estimate=True) as show:
         on_event = event_printer(show, TimeLeft(plan, 60.0))
-        for event in (Started(104, 0), BlockStarted(block), Preparing(setting, 1, 4)):
+        for event in (BlockStarted(block), Preparing(setting, 1, 4)):
             on_event(event)
         for one in study.episodes:
             on_event(EpisodeEnd(one, True, 2.0))
@@ -671,7 +669,8 @@ def test_a_busy_machine_is_said_once_and_kept(load, lines, tmp_path, capsys, mon
     monkeypatch.setattr("os.getloadavg", lambda: (load, 0.0, 0.0))
     monkeypatch.setattr("os.cpu_count", lambda: 2)
     with progress_bar("episodes") as show:
-        store, _ = swept(tmp_path, STUDY, on_event=event_printer(show))
+        left = TimeLeft(planned(opened(tmp_path), STUDY), 1.0)
+        store, _ = swept(tmp_path, STUDY, on_event=event_printer(show, left))
     assert capsys.readouterr().err.count("the load average is 1.5 per core") == lines
     (told,) = {about["provenance"]["load"] for about in further_of(load_study(store))["labels"].values()}
     assert told == str(load / 2)

@@ -15,8 +15,7 @@ from kerv_cli.episodes import identity
 from kerv_cli.episodes.identity import ENGINE, Setting, hash_of, without
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.plan import Block, all_episodes, blocks_of
-from kerv_cli.lab.read import counts_of, frame_of, is_stored, loaded
-from kerv_cli.lab.store import Study, remove_study
+from kerv_cli.lab.store import Study, counts_of, frame_of, loaded, remove_study, row_of
 from kerv_cli.lab.study import plan_study
 from kerv_cli.report.summary import not_in_turn
 from kerv_cli.report.tables import load_study
@@ -165,7 +164,7 @@ def test_another_study_runs_only_what_it_does_not_share(database):
     other, outcome = swept(database.results, study)
     assert len(outcome.reused) == 8
     remove_study(store)
-    assert not is_stored(store)
+    assert row_of(store) is None
     assert counts_of(other) == (12, 12)
     assert len(table_of(other)) == 3
     assert len(to_run(planned(database, threshold_study(["reach-v3"])))) == 2  # only naive_sd and r=9 are gone

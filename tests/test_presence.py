@@ -13,10 +13,8 @@ from conftest import refused, write_policy
 from kerv_cli.base.errors import UsageError
 from kerv_cli.episodes.runner import Runner
 from kerv_cli.lab.database import opened
-from kerv_cli.lab.presence import Presence, bury, living
-from kerv_cli.lab.read import frame_of
-from kerv_cli.lab.runs import Run
-from kerv_cli.lab.store import Study
+from kerv_cli.lab.runs import Presence, Run, bury, living
+from kerv_cli.lab.store import Study, frame_of
 
 STUDY = """
 common: policy=state policy.target=nano-state task=reach world.horizon=4 episodes=3 record=0
@@ -87,7 +85,7 @@ def test_only_one_process_makes_an_artifact(tmp_path, apart):
 DIES = """
 import os, sys
 from kerv_cli.lab.database import Database
-from kerv_cli.lab.presence import Presence
+from kerv_cli.lab.runs import Presence
 with Presence(Database(sys.argv[1]), "a run"):
     os.kill(os.getpid(), 9)
 """
@@ -107,7 +105,7 @@ def test_a_killed_process_of_this_machine_is_known_at_once(tmp_path):
 
 def test_an_interrupt_in_a_transaction_frees_its_lock_before_the_heart_is_awaited(tmp_path, monkeypatch):
     """As SQLAlchemy leaves it if Ctrl-C comes between BEGIN and the code that would roll back."""
-    monkeypatch.setattr("kerv_cli.lab.presence.BEAT_SECONDS", 0.05)
+    monkeypatch.setattr("kerv_cli.lab.runs.BEAT_SECONDS", 0.05)
     database, began = opened(tmp_path), time.monotonic()
     with pytest.raises(KeyboardInterrupt), Presence(database):  # noqa: PT012
         left = database.writing()

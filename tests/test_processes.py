@@ -45,7 +45,7 @@ def run():
     except KeyboardInterrupt:
         print("cleared", flush=True)
 
-kerv_cli.cli.app.app = run
+kerv_cli.cli.app.program.main = run
 kerv.main()
 """
 WRITER = """
@@ -74,7 +74,7 @@ def run():
         database.close()
     print("all written")
 
-kerv_cli.cli.app.app = run
+kerv_cli.cli.app.program.main = run
 kerv.main()
 """
 

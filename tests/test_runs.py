@@ -18,9 +18,8 @@ from command import kerv
 
 from kerv_cli.catalogue.entries import find_runs
 from kerv_cli.lab.database import opened
-from kerv_cli.lab.read import decodes_of, frame_of, loaded
 from kerv_cli.lab.runs import Run
-from kerv_cli.lab.store import Study
+from kerv_cli.lab.store import Study, decodes_of, frame_of, loaded
 from kerv_cli.lab.work import EpisodeRunner
 
 FAST = ["policy=state", "policy.target=nano-state", "task=reach-v3", "world.horizon=8", "record=0"]

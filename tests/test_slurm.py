@@ -17,8 +17,7 @@ from kerv_cli.base.config import compose
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import EPISODES, UNFINISHED, WANTED, opened
-from kerv_cli.lab.read import counts_of
-from kerv_cli.lab.store import Study
+from kerv_cli.lab.store import Study, counts_of
 from kerv_cli.lab.work import Counted
 
 STUDY = threshold_study(["reach-v3", "push-v3"], episodes=6, radii=(3,), block=2)

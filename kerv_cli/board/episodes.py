@@ -18,8 +18,7 @@ from kerv_cli.board import episode
 from kerv_cli.board.pages import database_of, render
 from kerv_cli.catalogue.episodes import outcomes
 from kerv_cli.episodes.identity import Setting, stress_of
-from kerv_cli.lab.read import loaded
-from kerv_cli.lab.store import Study
+from kerv_cli.lab.store import Study, loaded
 from kerv_cli.report.measures import NEAR
 from kerv_cli.report.tables import references_of
 

@@ -19,9 +19,8 @@ from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.board.pages import database_of, refreshed, render
 from kerv_cli.catalogue.entries import RunEntry, children, description_of, disk_bytes, find_run, find_runs, parents
 from kerv_cli.lab.database import Database
-from kerv_cli.lab.read import counts_of, loaded, version_of
 from kerv_cli.lab.runs import RUNNING, run_rows
-from kerv_cli.lab.store import Study
+from kerv_cli.lab.store import Study, counts_of, loaded, version_of
 from kerv_cli.report.tables import flatten
 
 # Choice of the filter by state -> whether a run is shown

@@ -24,7 +24,7 @@ from kerv_cli.base.paths import shipped_dir
 from kerv_cli.base.registry import ArtifactPart
 from kerv_cli.episodes.identity import OBSERVATION
 from kerv_cli.lab.database import EPISODES, SETTINGS, STUDIES, WANTED, Database
-from kerv_cli.lab.runs import COMPLETE, RUNNING, RunRow, forget, run_rows, time_left
+from kerv_cli.lab.runs import COMPLETE, RUNNING, forget, run_rows, time_left
 from kerv_cli.lab.store import ROLLOUT, SWEEP, Study, remove_study
 
 LOG, WEIGHTS = "log.csv", "model.safetensors"  # files of a training
@@ -97,19 +97,19 @@ def find_runs(database: Database) -> list[RunEntry]:
     for row in reversed(run_rows(database)):
         newest[row.kind, row.name] = row
         if row.status == COMPLETE:
-            finished.add((row.kind, row.name, row.command))
+            finished.add((row.kind, row.name, *row.command))
     for (kind, name), row in newest.items():
         entry = found.get((kind, name))
         if entry is None:
             if kind in _STUDIES or row.status == COMPLETE:
                 continue  # what the command made was removed
             entry = RunEntry(f"{kind}/{name}", kind, folder / kind / name, "", "", (kind,))
-        found[kind, name] = _with_command(entry, row, (kind, name, row.command) in finished)
+        found[kind, name] = _with_command(entry, row, (kind, name, *row.command) in finished)
     return sorted(found.values(), key=attrgetter("started", "id"), reverse=True)
 
 
-def _with_command(entry: RunEntry, row: RunRow, is_finished: bool) -> RunEntry:
-    entry, is_running = replace(entry, command=row.command), row.status == RUNNING
+def _with_command(entry: RunEntry, row: Any, is_finished: bool) -> RunEntry:
+    entry, is_running = replace(entry, command=tuple(row.command)), row.status == RUNNING
     is_repeat = is_finished and entry.state == COMPLETE
     if not entry.has_episodes and (row.status == COMPLETE or (is_repeat and not is_running)):
         return entry

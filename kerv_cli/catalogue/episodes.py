@@ -13,8 +13,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.lab.database import BLOCKS, EPISODES, MEASURES, SETTINGS, STUDIES, WANTED, Database
 from kerv_cli.lab.plan import Episode
-from kerv_cli.lab.read import decodes_of, setting_of
-from kerv_cli.lab.store import Study
+from kerv_cli.lab.store import Study, decodes_of, setting_of
 
 LARGEST_ID = 2**31 - 1
 

@@ -58,7 +58,7 @@ class Commands(FastFlags, TyperGroup):
 
 
 class Kerv(Commands):
-    """The command `kerv` itself. It prints each error as one line."""
+    """The command `kerv` itself. It runs the command that was typed, and prints each error as one line."""
 
     def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
         self.words = list(args)
@@ -67,7 +67,7 @@ class Kerv(Commands):
 
     def invoke(self, ctx: Any) -> Any:
         with one_line_errors(self.words):
-            return super().invoke(ctx)
+            return super().invoke(ctx)()
 
 
 app = typer.Typer(
@@ -97,3 +97,6 @@ def kerv(
     ] = False,
 ) -> None:
     """Accept the options of `kerv` itself."""
+
+
+program = typer.main.get_command(app)

@@ -165,21 +165,22 @@ class CommandWithSettings(FastFlags, TyperCommand):
     part: Command
     arguments: list[str]
 
-    def invoke(self, ctx: Any) -> None:
+    def invoke(self, ctx: Any) -> Callable[[], None]:
+        """Compose the settings. Return a function without arguments that runs the command."""
         from kerv_cli.lab.command import chosen_store, noted
 
-        part, options = self.part, ctx.params
-        with chosen_store(ctx.args) as words:
-            overrides, names = _split(part, words) if "names" in self.arguments else (words, [])
-            given: dict[str, Any] = {"overrides": overrides, "names": names}
-            if "settings" in self.arguments:
-                given["settings"] = _settings(part, overrides, options.pop("cfg"))
-            if options.get("plan") and isinstance(given.get("settings"), RunSettings):
-                from kerv_cli.base.runtime import device_of  # imports torch
+        part, options, whole = self.part, ctx.params, ctx.find_root()
+        words = whole.with_resource(chosen_store(ctx.args))
+        overrides, names = _split(part, words) if "names" in self.arguments else (words, [])
+        given: dict[str, Any] = {"overrides": overrides, "names": names}
+        if "settings" in self.arguments:
+            given["settings"] = _settings(part, overrides, options.pop("cfg"))
+        if options.get("plan") and isinstance(given.get("settings"), RunSettings):
+            from kerv_cli.base.runtime import device_of  # imports torch
 
-                device_of(given["settings"].runtime)
-            with noted([*part.name.split(), *overrides, *names]):
-                part.code(**{name: given[name] for name in self.arguments}, **options)
+            device_of(given["settings"].runtime)
+        whole.with_resource(noted([*part.name.split(), *overrides, *names]))
+        return functools.partial(part.code, **{name: given[name] for name in self.arguments}, **options)
 
     def format_epilog(self, ctx: Any, formatter: Any) -> None:
         below = commands(self.part.name)

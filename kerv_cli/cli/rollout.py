@@ -42,10 +42,10 @@ def rollout(
         return
     announce(resolved, is_rollout=True)
     from kerv_cli.lab.database import opened
-    from kerv_cli.lab.follow import TimeLeft
     from kerv_cli.lab.store import ROLLOUT
     from kerv_cli.lab.study import check
     from kerv_cli.lab.study import plan as plan_rollout
+    from kerv_cli.lab.workers import TimeLeft
 
     words = ["rollout", *(["-m"] if multirun else []), *overrides]
     planned = plan_rollout(resolved, check(resolved), opened(resolved.first.results), words, ROLLOUT)

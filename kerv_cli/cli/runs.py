@@ -164,7 +164,7 @@ def export(settings: CommandSettings, names: list[str], folder: Folder = None, a
     """
     from kerv_cli.base.files import write_text
     from kerv_cli.catalogue.entries import find_run, store_of
-    from kerv_cli.lab.read import frame_of, how_to_run
+    from kerv_cli.lab.store import frame_of, how_to_run
 
     (name,) = _run_names(names)
     database = database_of(settings)

@@ -23,9 +23,9 @@ from kerv_cli.cli.common import (
 
 if TYPE_CHECKING:
     from kerv_cli.episodes.resolve import ResolvedStudy
-    from kerv_cli.lab.follow import Outcome, TimeLeft
     from kerv_cli.lab.study import Plan
-    from kerv_cli.lab.work import Event
+    from kerv_cli.lab.work import Event, Outcome
+    from kerv_cli.lab.workers import TimeLeft
     from kerv_cli.report.report import Report
     from kerv_cli.report.reprice import Priced
     from kerv_cli.report.tables import StudyData
@@ -69,7 +69,7 @@ def print_settings(resolved: ResolvedStudy) -> None:
 
 def print_study_plan(planned: Plan, as_json: bool, guess: float = SECONDS_PER_EPISODE) -> None:
     """Print which episodes would run, why, and how long that would take. `guess`: seconds, if none was measured."""
-    from kerv_cli.lab.follow import TimeLeft
+    from kerv_cli.lab.workers import TimeLeft
 
     rows, to_run, reused, study = _plan_rows(planned), planned.to_run, planned.existing, planned.study
     left = TimeLeft(planned, guess)
@@ -103,7 +103,7 @@ def _plan_rows(planned: Plan) -> list[dict[str, object]]:
 
 def run_plan(planned: Plan, guess: float = SECONDS_PER_EPISODE) -> Outcome:
     """Run the missing episodes of a plan and show the progress, with the time left."""
-    from kerv_cli.lab.follow import TimeLeft, run
+    from kerv_cli.lab.workers import TimeLeft, run
     from kerv_cli.report.viewing import save_recording
 
     with progress_bar("episodes", has_estimate=True) as show:
@@ -113,27 +113,24 @@ def run_plan(planned: Plan, guess: float = SECONDS_PER_EPISODE) -> Outcome:
 def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None = None) -> Callable[[Event], None]:
     """Return a function that prints a line about each event of a running study and moves its progress bar by `show`.
 
-    If standard error is no terminal, only the first 100 episodes get a line each.
+    `left` is of the plan that begins now. If standard error is no terminal, only the first 100 episodes get a line
+    each.
     """
-    from kerv_cli.lab.work import BlockStarted, BlocksWait, Counted, Preparing, SettingFailed, Started
+    from kerv_cli.lab.work import BlockStarted, BlocksWait, Counted, Preparing, SettingFailed
 
-    total = ended = 0
-    title = "starting"
-    on_terminal = sys.stderr.isatty()
+    total = 0 if left is None else _say_what_begins(left)
+    ended, title, on_terminal = 0, "starting", sys.stderr.isatty()
+
+    def move() -> None:
+        if left is not None and total:
+            show(ended, total, f"about {duration(left.seconds)} left, {title}")
 
     def on_event(event: Event) -> None:
-        nonlocal total, ended, title
+        nonlocal ended, title
         line = ""
         if left is not None:
             left.see(event)
-        if isinstance(event, Started):
-            if event.load > BUSY:
-                typer.echo(f"the load average is {event.load:g} per core: other programs slow these times", err=True)
-            total, ended = event.to_run, 0
-            line = f"{count(event.reused, 'episode')} there already" if event.reused else ""
-            if left is not None and total:
-                line = ", ".join(filter(None, (line, f"{total} to run", about(left.seconds, left.source))))
-        elif isinstance(event, Counted):
+        if isinstance(event, Counted):
             ended = max(0, total - event.left)
         elif isinstance(event, BlockStarted):
             title = event.block.title
@@ -157,15 +154,30 @@ def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None =
                 line = f"{ended}{of_all} {one.setting.label} on {one.task}, seed {one.seed}: {result}"
         if line:
             typer.echo(line, err=True)
-        if total and not isinstance(event, Preparing):
-            show(ended, total, title if left is None else f"about {duration(left.seconds)} left, {title}")
+        if not isinstance(event, Preparing):
+            move()
 
+    move()
     return on_event
+
+
+def _say_what_begins(left: TimeLeft) -> int:
+    from kerv_cli.lab.work import load_per_core
+
+    plan, load = left.plan, load_per_core()
+    if load > BUSY and any(block.batch == 1 for block in plan.blocks):
+        typer.echo(f"the load average is {load:g} per core: other programs slow these times", err=True)
+    total, reused = len(plan.to_run), len(plan.existing)
+    there = f"{count(reused, 'episode')} there already" if reused else ""
+    line = ", ".join(filter(None, (there, f"{total} to run, {about(left.seconds, left.source)}" if total else "")))
+    if line:
+        typer.echo(line, err=True)
+    return total
 
 
 def print_study(data: StudyData, all_columns: bool = False, how: str = "") -> None:
     """Print the table of a study and its note. `how` is what to type to see all columns."""
-    from kerv_cli.lab.read import sweep_command
+    from kerv_cli.lab.store import sweep_command
     from kerv_cli.report.summary import SummaryTable, not_in_turn
 
     study = data.study

@@ -29,8 +29,8 @@ from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 
 if TYPE_CHECKING:
     from kerv_cli.episodes.resolve import ResolvedStudy
-    from kerv_cli.lab.follow import Outcome
     from kerv_cli.lab.store import Study
+    from kerv_cli.lab.work import Outcome
     from kerv_cli.report.tables import StudyData
 
 
@@ -64,10 +64,9 @@ def sweep(overrides: list[str], cfg: Cfg = False, show_plan: ShowPlan = False, a
         return
     announce(resolved)
     from kerv_cli.lab.database import opened
-    from kerv_cli.lab.follow import TimeLeft, begun, follow
     from kerv_cli.lab.study import check, plan, save
-    from kerv_cli.lab.work import EpisodeRunner
-    from kerv_cli.lab.workers import workers
+    from kerv_cli.lab.work import EpisodeRunner, follow
+    from kerv_cli.lab.workers import TimeLeft, begun, workers
     from kerv_cli.report.viewing import save_recording
 
     with _first_commands(resolved, overrides):
@@ -147,7 +146,7 @@ def print_outcome(study: Study, outcome: Outcome, data: StudyData | None, as_jso
 
 def write(study: Study, outcome: Outcome, data: StudyData | None, loss: float) -> None:
     """Write the report of a complete study, and print its verdict."""
-    from kerv_cli.lab.read import counts_of
+    from kerv_cli.lab.store import counts_of
     from kerv_cli.report.report import write_study
     from kerv_cli.report.tables import load_study
 

@@ -71,19 +71,28 @@ def close_worlds() -> None:
 class Runner:
     """Runs episodes of one setting (a method with all its options) on one task. The decoder is built only once.
 
-    The episodes may alternate with episodes of other runners, because decoders share no state.
+    The episodes may alternate with episodes of other runners, because decoders share no state. With `save`, the
+    episodes that the settings ask for are recorded and handed to this function.
     """
 
-    def __init__(self, settings: RolloutSettings, task: str) -> None:
-        self.settings, self.task = settings, task
+    def __init__(
+        self, settings: RolloutSettings, task: str, save: Callable[[EpisodeRecord], object] | None = None
+    ) -> None:
+        self.settings, self.task, self.save = settings, task, save
         self.decoder = decoder_for(settings, task)
         self.stress = build_stress(settings.world.stress)
         self.clock = clock_for(settings, spec_of(task))
         self._recording = dataclasses.replace(settings.world.camera, size=settings.record_size, supersample=1)
 
     def episode(self, seed: int, recorded: bool = False) -> EpisodeRecord:
+        recorded = recorded or (self.save is not None and is_recorded(self.settings, seed))
         world = open_world(self.task, self.settings.world, self.stress)  # another runner may have closed it since
-        return run_episode(world, self.decoder, seed, self._recording if recorded else None, self.clock)
+        record = run_episode(world, self.decoder, seed, self._recording if recorded else None, self.clock)
+        if self.save is None:
+            return record
+        if record.frames:
+            self.save(record)
+        return dataclasses.replace(record, frames={}, places={})
 
 
 @dataclass(frozen=True)

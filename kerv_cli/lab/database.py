@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
-import re
 import sqlite3
 import threading
 from collections.abc import Iterator
@@ -26,7 +25,7 @@ from kerv_cli.episodes.rows import EPISODE_SCHEMA, FLAG, FLOAT, INT
 from kerv_cli.lab.command import current_store, without_passwords
 
 FILE = "kerv.db"
-SCHEMA = 2
+SCHEMA = "2"
 """Version of the tables. A database with another version is refused."""
 LOCK_SECONDS = 60
 """Longest time to wait for another process's transaction in a SQLite file, seconds."""
@@ -84,7 +83,7 @@ RUNS = _table(
     sa.Index("runs_of_name", "kind", "name"),
 )
 WORKERS = _table(
-    "workers",  # one row per living command or worker; `lab/presence.py` says who lives
+    "workers",  # one row per living command or worker; `lab/runs.py` says who lives
     sa.Column("name", _Text, primary_key=True),
     *_required(_Text, "run", "host"),  # run: id of the command for which it works; empty: any command
     *_required(sa.Double, "heartbeat"),  # newest sign of life, seconds since 1970 by the database's clock
@@ -175,13 +174,11 @@ class Database:
         url = url or sa.URL.create("sqlite", database=str(self.results.absolute() / FILE))
         try:
             parsed = sa.make_url(url)
-        except (sa.exc.ArgumentError, ValueError) as error:
-            raise UsageError(
-                f"store={without_passwords(str(url))} is not a URL: write postgresql://USER@HOST/DB"
-            ) from error
+        except (sa.exc.ArgumentError, ValueError):
+            parsed = None
+        if parsed is None or parsed.drivername not in ("sqlite", "postgresql", "postgresql+psycopg"):
+            raise UsageError(f"store={without_passwords(str(url))} is no database: write postgresql://USER@HOST/DB")
         self.file = Path(parsed.database or "") if parsed.drivername == "sqlite" else None
-        if self.file is None and parsed.drivername not in ("postgresql", "postgresql+psycopg"):
-            raise UsageError(f"store={parsed.drivername}:// is not supported: use postgresql://USER@HOST/DB")
         self.shown = str(self.file or without_passwords(str(url)))
         self._url = parsed if self.file else parsed.set(drivername="postgresql+psycopg")
         self._engine: sa.Engine | None = None
@@ -229,16 +226,6 @@ class Database:
                 yield connection
 
     @contextlib.contextmanager
-    def kept_open(self) -> Iterator[None]:
-        """Keep a SQLite file open during the `with` block, so that its transactions are quick.
-
-        When the last connection to the file is closed, SQLite moves its log into the file and flushes both to the disk.
-        That is slow.
-        """
-        with self.reading() if self.file else contextlib.nullcontext():
-            yield
-
-    @contextlib.contextmanager
     def writing(self) -> Iterator[sa.Connection]:
         """Yield a connection in a transaction, which is committed when the `with` block ends."""
         with self._errors():
@@ -259,7 +246,10 @@ class Database:
                     version = _created(connection)
             if version != SCHEMA:
                 engine.dispose()
-                raise other_schema(self.shown, version)
+                raise CheckpointError(
+                    f"{self.shown} is of another kerv (schema {version}, this one reads {SCHEMA}): choose another "
+                    "folder with results=; 'kerv runs export NAME' of that kerv writes its tables"
+                )
             self._engine = engine
         return self._engine
 
@@ -387,29 +377,16 @@ def roll_back() -> None:
             before.rollback()
 
 
-def _version(connection: sa.Connection) -> int | None:
+def _version(connection: sa.Connection) -> Any:
     if not sa.inspect(connection).has_table(ABOUT.name):
         return None
-    version = connection.scalar(sa.select(ABOUT.c.value).where(ABOUT.c.key == "schema_version"))
-    if version is not None and not re.fullmatch(r"[1-9]\d{0,8}", str(version), re.ASCII):
-        raise Damaged(f"schema_version is {version!r:.60}")
-    return None if version is None else int(version)
+    return connection.scalar(sa.select(ABOUT.c.value).where(ABOUT.c.key == "schema_version"))
 
 
-def _created(connection: sa.Connection) -> int:
+def _created(connection: sa.Connection) -> Any:
     """Create the tables, if no other process has done so in the meantime. Return the version of their schema."""
     version = _version(connection)
     if version is None:
         _META.create_all(connection)
-        connection.execute(sa.insert(ABOUT).values(key="schema_version", value=str(SCHEMA)))
+        connection.execute(sa.insert(ABOUT).values(key="schema_version", value=SCHEMA))
     return SCHEMA if version is None else version
-
-
-def other_schema(name: str | Path, version: int) -> CheckpointError:
-    """Return the error to raise for a database that an older or newer version of kerv has written."""
-    if version < SCHEMA:
-        return CheckpointError(
-            f"{name} is of kerv 1.0 (schema {version}, this one reads {SCHEMA}): choose another folder with results=; "
-            "'kerv runs export NAME' of kerv 1.0 writes its tables"
-        )
-    return CheckpointError(f"{name} is from a newer kerv (schema {version}, this one reads {SCHEMA}): update kerv")

@@ -73,23 +73,6 @@ def all_episodes(settings: Sequence[Setting], tasks: Iterable[str], block: int =
 
 
 @dataclass(frozen=True)
-class StoredEpisode:
-    """An episode in the database that a study may reuse.
-
-    Attributes:
-        id: Row number of the episode.
-        block: Id of the block (episodes run by one process) in which it ran.
-        started: Time at which that block began (ISO 8601).
-        seeds: Seeds of the block, as `seeds_text` writes them.
-    """
-
-    id: int
-    block: str
-    started: str
-    seeds: str
-
-
-@dataclass(frozen=True)
 class Block:
     """Episodes of one task, which one process runs. The settings take turns, seed by seed.
 
@@ -145,7 +128,7 @@ class Block:
 def split(
     episodes: Sequence[Episode],
     block: int,
-    stored: Mapping[Key, Sequence[StoredEpisode]],
+    stored: Mapping[Key, Sequence[Any]],
     known: Mapping[Episode, Any],
     rerun: str = NEVER,
     earlier: Mapping[str, Setting] | None = None,
@@ -155,7 +138,7 @@ def split(
     Args:
         episodes: The study's episodes.
         block: Number of seeds in a block, which one process runs.
-        stored: Episodes in the database, by `Episode.key`.
+        stored: Episodes in the database, by `Episode.key`: their `id`, and their block with its `started` and `seeds`.
         known: Rows of the table WANTED that the study has already. A row keeps its episode. A row that ALL has emptied
             stays empty until it has run.
         rerun: Which existing episodes to run again, NEVER or ALL.
@@ -165,7 +148,7 @@ def split(
         Two mappings: from each existing episode to its row number, and from each missing episode to the reason for
         running it.
     """
-    usable: dict[Episode, list[StoredEpisode]] = {}
+    usable: dict[Episode, list[Any]] = {}
     for one in episodes:
         row, rows = known.get(one), list(stored.get(one.key, ()))
         linked = [each for each in rows if row is not None and each.id == row.episode_id]
@@ -173,29 +156,18 @@ def split(
         usable[one] = [] if is_anew else linked or rows
     _keep_whole_orders(usable, block)
     existing = {one: max(row.id for row in rows) for one, rows in usable.items() if rows}
-    for part in ordered_parts(episodes, block):
-        if not existing.keys() >= set(part):
-            for one in part:
-                existing.pop(one, None)
     return existing, _reasons(episodes, stored, existing, rerun, earlier or {})
 
 
 def _reasons(
     episodes: Sequence[Episode],
-    stored: Mapping[Key, Sequence[StoredEpisode]],
+    stored: Mapping[Key, Sequence[Any]],
     existing: Mapping[Episode, int],
     rerun: str,
     earlier: Mapping[str, Setting],
 ) -> dict[Episode, str]:
-    works, tasks = set(), set()
-    for work, task, *_ in stored:
-        works.add(work)
-        tasks.add((work, task))
-
-    @functools.cache
-    def change(setting: Setting) -> str:
-        return differences(setting, earlier.get(setting.label))
-
+    works, tasks = {work for work, _, _ in stored}, {(work, task) for work, task, _ in stored}
+    change = functools.cache(lambda setting: differences(setting, earlier.get(setting.label)))
     reasons = {}
     for one in episodes:
         if one in existing:
@@ -231,7 +203,7 @@ def ordered_parts(episodes: Iterable[Episode], block: int) -> list[list[Episode]
     return list(grouped(filter(attrgetter("setting.depends_on_order"), episodes), key).values())
 
 
-def _keep_whole_orders(usable: dict[Episode, list[StoredEpisode]], block: int) -> None:
+def _keep_whole_orders(usable: dict[Episode, list[Any]], block: int) -> None:
     """Remove from `usable` the stored rows that cannot be reused because their episodes ran in another order.
 
     This concerns only settings whose results depend on the order of their episodes. Their rows are kept if a single
@@ -244,7 +216,7 @@ def _keep_whole_orders(usable: dict[Episode, list[StoredEpisode]], block: int) -
     sizes = Counter(map(attrgetter("block"), itertools.chain(*usable.values())))
     for part in ordered_parts(usable, block):
         seeds = seeds_text(map(attrgetter("seed"), part))
-        by_block: dict[str, list[StoredEpisode]] = {}
+        by_block: dict[str, list[Any]] = {}
         for row in itertools.chain(*map(usable.__getitem__, part)):
             if row.seeds == seeds:
                 by_block.setdefault(row.block, []).append(row)

@@ -29,9 +29,8 @@ from kerv_cli.lab.database import (
     Unanswered,
 )
 from kerv_cli.lab.plan import Block, Episode
-from kerv_cli.lab.presence import beats
-from kerv_cli.lab.read import IS_NO_ROLLOUT, RAN, setting_of
-from kerv_cli.lab.store import ROLLOUT, Study
+from kerv_cli.lab.runs import beats
+from kerv_cli.lab.store import IS_NO_ROLLOUT, RAN, ROLLOUT, Study, setting_of
 
 T = TypeVar("T")
 
@@ -84,7 +83,8 @@ class Queue:
         """
         with self.database.writing() as connection:
             others = self._others(connection)
-            is_open = sa.and_(self._of_study, self._is_free(others))
+            # a row of this worker is one whose claim was committed, but the answer was lost
+            is_open = sa.and_(self._of_study, sa.or_(WANTED.c.worker.is_(None), WANTED.c.worker.not_in(others)))
             first = sa.select(WANTED.c.block).where(is_open, WANTED.c.block.not_in(self._busy(connection, others)))
             number = first.order_by(WANTED.c.block).limit(1).correlate(None).scalar_subquery()
             taken = sa.update(WANTED).where(is_open, WANTED.c.block == number)
@@ -100,7 +100,9 @@ class Queue:
                 again = again.where(WANTED.c.episode_id.is_not(None)).values(**values)
                 rows = [*rows, *connection.execute(again.returning(WANTED)).all()]
             linked = self._link(connection, ordered)
-            run = self.run or connection.scalar(self._newest_run()) or ""
+            newest = sa.select(RUNS.c.id).order_by(RUNS.c.started.desc(), RUNS.c.id.desc()).limit(1)
+            newest = newest.where(RUNS.c.kind == self.study.kind, RUNS.c.name == self.study.name)
+            run = self.run or connection.scalar(newest) or ""
         episodes, deadly = dict[Any, Episode](), None
         for row in sorted(rows, key=lambda row: row.position):
             one = Episode(settings[row.setting_id], row.task, row.seed)
@@ -114,27 +116,16 @@ class Queue:
             sa.select(WORKERS.c.name).where(beats(connection), WORKERS.c.name != self.worker)
         ).all()
 
-    def _is_free(self, others: Sequence[str]) -> sa.ColumnElement[bool]:
-        # a row of this worker is one whose claim was committed, but the answer was lost
-        return sa.or_(WANTED.c.worker.is_(None), WANTED.c.worker.not_in(others))
-
-    def _busy(self, connection: sa.Connection, others: Sequence[str]) -> set[int]:
+    def _busy(self, connection: sa.Connection, others: Sequence[str]) -> Sequence[int]:
         """Return the blocks with an episode that a worker runs now for another study: it will be linked."""
-        if self.study.kind == ROLLOUT:  # rollouts share no episodes with other studies
-            return set()
-        query = sa.select(SETTINGS.c.work, WANTED.c.task, WANTED.c.seed).select_from(PLANNED)
-        query = query.where(WANTED.c.worker.in_(others), UNFINISHED, STUDIES.c.kind != ROLLOUT)
-        held = {tuple(row) for row in connection.execute(query.where(STUDIES.c.id != self.number))}
-        if not held:
-            return set()
-        works, tasks, seeds = map(set, zip(*held, strict=True))
-        mine = sa.select(WANTED.c.block, SETTINGS.c.work, WANTED.c.task, WANTED.c.seed).select_from(PLANNED)
-        mine = mine.where(SETTINGS.c.work.in_(works), WANTED.c.task.in_(tasks), WANTED.c.seed.in_(seeds))
-        return {row[0] for row in connection.execute(mine.where(self._of_study)) if tuple(row[1:]) in held}
-
-    def _newest_run(self) -> sa.Select[Any]:
-        same = RUNS.c.kind == self.study.kind, RUNS.c.name == self.study.name
-        return sa.select(RUNS.c.id).where(*same).order_by(RUNS.c.started.desc(), RUNS.c.id.desc()).limit(1)
+        episode = SETTINGS.c.work, WANTED.c.task, WANTED.c.seed
+        query = sa.select(*episode).select_from(PLANNED).where(WANTED.c.worker.in_(others), UNFINISHED)
+        query = query.where(STUDIES.c.kind != ROLLOUT, STUDIES.c.id != self.number)
+        held = list(map(tuple, connection.execute(query)))
+        if not held or self.study.kind == ROLLOUT:  # rollouts share no episodes with other studies
+            return []
+        mine = sa.select(WANTED.c.block).select_from(PLANNED).where(self._of_study, sa.tuple_(*episode).in_(held))
+        return connection.scalars(mine).all()
 
     def _settings_of(self, connection: sa.Connection, rows: Sequence[Any]) -> Mapping[int, Setting]:
         if not self._settings.keys() >= {row.setting_id for row in rows}:
@@ -210,10 +201,22 @@ class Queue:
             for one in episodes:
                 self._change(connection, one, sa.true(), error=error, attempts=0)
 
-    def left(self) -> int:
-        """Return the number of unfinished rows of the study."""
+    def left(self, plan: Study | None = None) -> int:
+        """Return the number of unfinished episodes of the study, or of those that a plan of the study has."""
+        query = sa.select(SETTINGS.c.work, WANTED.c.task, WANTED.c.seed).distinct().select_from(WANTED.join(SETTINGS))
+        if plan is not None:
+            seeds = [one.seed for one in plan.episodes]
+            of_plan = WANTED.c.task.in_(plan.tasks), WANTED.c.seed.between(min(seeds), max(seeds))
+            query = query.where(*of_plan, SETTINGS.c.label.in_(plan.labels))
         with self.database.reading() as connection:
-            return connection.scalar(sa.select(sa.func.count()).select_from(WANTED).where(self._of_study)) or 0
+            counted = sa.select(sa.func.count()).select_from(query.where(self._of_study).subquery())
+            return connection.scalar(counted) or 0
+
+    def has_workers(self) -> bool:
+        """Return whether another worker runs an episode of the study."""
+        with self.database.reading() as connection:
+            held = self._of_study, WANTED.c.worker.in_(self._others(connection))
+            return bool(connection.scalar(sa.select(sa.exists().where(*held))))
 
 
 def patiently(action: Callable[..., T], *arguments: Any) -> T:

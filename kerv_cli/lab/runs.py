@@ -1,88 +1,207 @@
-"""The table `runs` of the database: one row per command that was started (a run).
+"""Commands that were started (runs), one row each, and who lives: a row per command and worker, with a heartbeat.
 
-A row says which process runs the command, how far it is, and how it ended.
+Times are those of the database's own clock, because the clocks of two machines may differ. Each process also holds a
+lock on a file. The operating system gives the lock back when the process ends, however it ends, so a process of this
+machine that was killed is known at once.
 """
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import functools
+import os
 import secrets
 import socket
+import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import sqlalchemy as sa
 
 from kerv_cli.base.durations import left
-from kerv_cli.base.errors import CheckpointError, Interrupted, StorageError, UsageError
+from kerv_cli.base.errors import CheckpointError, Interrupted, KervError, StorageError, UsageError
+from kerv_cli.base.files import storage_errors
 from kerv_cli.lab.command import current_command
-from kerv_cli.lab.database import EPISODES, RUNS, STUDIES, WORKERS, Database, now
-from kerv_cli.lab.presence import Presence, living
+from kerv_cli.lab.database import (
+    EPISODES,
+    RUNS,
+    STUDIES,
+    UNFINISHED,
+    WANTED,
+    WORKERS,
+    Database,
+    clock,
+    now,
+    roll_back,
+)
 from kerv_cli.targets.provenance import git_commit
 
 RUNNING, COMPLETE, FAILED, INTERRUPTED = "running", "complete", "failed", "interrupted"
 
 
-@dataclass(frozen=True)
-class RunRow:
-    """A row of the table `runs`: one command that was started.
+BEAT_SECONDS = 5.0
+"""Seconds between two heartbeats."""
+LAPSE_SECONDS = 30.0
+"""Seconds without a heartbeat after which others may run what a worker has claimed."""
+_FORGET_SECONDS = 86_400.0
+_FOLDER = ".workers"
 
-    `status` is `running`, `complete`, `failed` or `interrupted`. A running command whose process is dead counts as
-    interrupted. `seen` is its newest sign of life, seconds since 1970, 0 if it has ended.
+
+@functools.cache
+def _machine() -> bytes:
+    """Return what is the same for all processes of a kernel: two containers may have one host name."""
+    with contextlib.suppress(OSError):
+        return Path("/proc/sys/kernel/random/boot_id").read_bytes().strip()
+    return socket.gethostname().encode()
+
+
+def _lock_of(database: Database, name: str) -> Path:
+    return database.results / _FOLDER / f"{name}.lock"
+
+
+def _lock(path: Path) -> int:
+    with storage_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        with contextlib.suppress(OSError):  # a file system without locks: others rely on the heartbeat
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            os.write(descriptor, _machine())
+    return descriptor
+
+
+def _was_killed(path: Path) -> bool:
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except OSError:  # it is a process of another machine
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        return os.read(descriptor, 100) == _machine()
+    except OSError:
+        return False
+    finally:
+        os.close(descriptor)
+
+
+def beats(connection: sa.Connection) -> sa.ColumnElement[bool]:
+    """Return the condition that a row of WORKERS had a heartbeat lately."""
+    return WORKERS.c.heartbeat >= clock(connection) - LAPSE_SECONDS
+
+
+def living(database: Database, connection: sa.Connection) -> dict[str, str]:
+    """Return the name of each living command and worker, with the id of the command for which it works."""
+    rows = connection.execute(sa.select(WORKERS.c.name, WORKERS.c.run).where(beats(connection)))
+    return {name: run for name, run in rows if not _was_killed(_lock_of(database, name))}
+
+
+def bury(database: Database) -> None:
+    """Remove the rows of killed processes of this machine, so that others may run what these had claimed."""
+    with database.reading() as connection:
+        names = connection.scalars(sa.select(WORKERS.c.name)).all()
+    dead = [name for name in names if _was_killed(_lock_of(database, name))]
+    if dead:
+        with database.writing() as connection:
+            connection.execute(sa.delete(WORKERS).where(WORKERS.c.name.in_(dead)))
+    for name in dead:
+        _lock_of(database, name).unlink(missing_ok=True)
+
+
+class Presence:
+    """Tells others that this process lives, from the start to the end of a `with` statement.
+
+    At the end, rows that it has claimed and not finished become free.
+
+    Args:
+        database: Where others look.
+        run: Id of the command for which it works. If empty, any command.
     """
 
-    id: str
-    kind: str
-    name: str
-    command: tuple[str, ...]
-    status: str
-    done: int
-    total: int
-    message: str
-    host: str
-    started: str
-    finished: str | None
-    git_commit: str
-    seen: float
+    def __init__(self, database: Database, run: str = "") -> None:
+        self.database, self.run = database, run
+        self.worker = f"{socket.gethostname()[:60]}-{secrets.token_hex(6)}"
+        self._lock: int | None = None
+        self._ended = threading.Event()
+        self._heart = threading.Thread(target=self._keep_beating, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._lock = _lock(_lock_of(self.database, self.worker))
+        try:
+            with self.database.writing() as connection:
+                self._begin_in(connection)
+        except BaseException:
+            self._unlock()
+            raise
+        self._heart.start()
+        return self
+
+    def _begin_in(self, connection: sa.Connection) -> None:
+        forgotten = WORKERS.c.heartbeat < clock(connection) - _FORGET_SECONDS
+        connection.execute(sa.delete(WORKERS).where(forgotten))
+        self.beat_in(connection)
+
+    def _unlock(self) -> None:
+        if self._lock is not None:
+            os.close(self._lock)
+            _lock_of(self.database, self.worker).unlink(missing_ok=True)
+
+    def beat_in(self, connection: sa.Connection) -> None:
+        """Write a sign of life, in a transaction."""
+        beaten = sa.update(WORKERS).where(WORKERS.c.name == self.worker).values(heartbeat=clock(connection))
+        if not connection.execute(beaten).rowcount:
+            row = {"name": self.worker, "run": self.run, "host": socket.gethostname()}
+            connection.execute(sa.insert(WORKERS).values(**row, heartbeat=clock(connection)))
+
+    def _keep_beating(self) -> None:
+        while not self._ended.wait(BEAT_SECONDS):
+            # the process itself will meet the same error and report it
+            with contextlib.suppress(KervError), self.database.writing() as connection:
+                self.beat_in(connection)
+
+    def _stop(self) -> None:
+        roll_back()  # otherwise the heart may wait for this thread's lock
+        self._ended.set()
+        if self._heart.is_alive():
+            self._heart.join()
+
+    def __exit__(self, *error: object) -> None:
+        self._stop()
+        mine = WANTED.c.worker == self.worker
+        with contextlib.suppress(StorageError), self.database.writing() as connection:
+            connection.execute(sa.update(WANTED).where(mine, UNFINISHED).values(worker=None, attempts=0))
+            connection.execute(sa.delete(WORKERS).where(WORKERS.c.name == self.worker))
+        self._unlock()
 
 
-_SEEN = sa.select(sa.func.max(WORKERS.c.heartbeat)).where(WORKERS.c.run == RUNS.c.id).scalar_subquery().label("seen")
+_SEEN = sa.select(sa.func.max(WORKERS.c.heartbeat)).where(WORKERS.c.run == RUNS.c.id).scalar_subquery()
 
 
-def _rows(database: Database, connection: sa.Connection, query: sa.Select[Any]) -> list[RunRow]:
-    alive, rows = set(living(database, connection).values()), []
-    for row in connection.execute(query):
-        status = INTERRUPTED if row.status == RUNNING and row.id not in alive else row.status
-        rows.append(
-            RunRow(**{**row._mapping, "command": tuple(row.command), "status": status, "seen": row.seen or 0.0})
-        )
-    return rows
+def _rows(database: Database, connection: sa.Connection, *where: sa.ColumnElement[bool]) -> Sequence[Any]:
+    is_dead = sa.and_(RUNS.c.status == RUNNING, RUNS.c.id.not_in(set(living(database, connection).values())))
+    status = sa.case((is_dead, INTERRUPTED), else_=RUNS.c.status).label("status")
+    columns = [column for column in RUNS.c if column is not RUNS.c.status]
+    query = sa.select(*columns, status, _SEEN.label("seen")).where(*where)
+    return connection.execute(query.order_by(RUNS.c.started.desc(), RUNS.c.id.desc())).all()
 
 
-def running(database: Database, connection: sa.Connection, kind: str, name: str) -> list[RunRow]:
-    """Return the living commands that make a study or an artifact."""
-    same = RUNS.c.kind == kind, RUNS.c.name == name, RUNS.c.status == RUNNING
-    return [row for row in _rows(database, connection, sa.select(RUNS, _SEEN).where(*same)) if row.status == RUNNING]
+def run_rows(database: Database, kind: str = "", name: str = "") -> Sequence[Any]:
+    """Return the rows of the commands that were started, newest first. A running command that is dead is interrupted.
 
-
-def run_rows(database: Database, kind: str | None = None, name: str | None = None) -> list[RunRow]:
-    """Return the commands that were started, newest first.
+    The column `seen` is a running command's newest sign of life, seconds since 1970.
 
     Args:
         database: The database.
-        kind: Only runs of this kind; None for all.
-        name: Only runs that made this study or artifact; None for all.
+        kind: Only runs of this kind; empty for all.
+        name: Only runs that made this study or artifact; empty for all.
     """
-    query = sa.select(RUNS, _SEEN).order_by(RUNS.c.started.desc(), RUNS.c.id.desc())
-    query = query if kind is None else query.where(RUNS.c.kind == kind)
-    query = query if name is None else query.where(RUNS.c.name == name)
+    where = [RUNS.c[key] == value for key, value in {"kind": kind, "name": name}.items() if value]
     with database.reading() as connection:
-        return _rows(database, connection, query)
+        return _rows(database, connection, *where)
 
 
-def time_left(row: RunRow) -> str:
+def time_left(row: Any) -> str:
     """Return the estimated remaining time of a running command, such as `about 3 min left`. Empty if unknown."""
     if row.status != RUNNING or not 0 < row.done < row.total:
         return ""
@@ -101,7 +220,7 @@ def pulse(database: Database) -> tuple[str, bool]:
     beat = sa.select(sa.func.max(WORKERS.c.heartbeat)).scalar_subquery()
     facts = sa.select(sa.func.count(), beat, studies, newest).select_from(RUNS)
     with database.reading() as connection:
-        rows = _rows(database, connection, sa.select(RUNS, _SEEN).where(RUNS.c.status == RUNNING))
+        rows = _rows(database, connection, RUNS.c.status == RUNNING)
         alive = [row.id for row in rows if row.status == RUNNING]
         return "/".join(map(str, [*connection.execute(facts).one(), *alive])), bool(alive)
 
@@ -137,11 +256,11 @@ class Run(Presence):
         self.total, self.done = total, 0
 
     def _begin_in(self, connection: sa.Connection) -> None:
-        others = running(self.database, connection, self.kind, self.name)
+        same = RUNS.c.kind == self.kind, RUNS.c.name == self.name, RUNS.c.status == RUNNING
+        others = [row for row in _rows(self.database, connection, *same) if row.status == RUNNING]
         if self.alone and others:
             whose = f"on {others[0].host} since {others[0].started[:16]}"
             raise UsageError(f"{self.kind} {self.name} is being made {whose}: wait for it, or choose another name")
-        same = RUNS.c.kind == self.kind, RUNS.c.name == self.name, RUNS.c.status == RUNNING
         dead = sa.update(RUNS).where(*same, RUNS.c.id.not_in([row.id for row in others]))
         connection.execute(dead.values(status=INTERRUPTED))
         connection.execute(
@@ -166,29 +285,24 @@ class Run(Presence):
                 self.beat_in(connection)
 
     def beat_in(self, connection: sa.Connection) -> None:
-        """Write a sign of life and the progress, in a transaction."""
         super().beat_in(connection)
-        progress = sa.update(RUNS).where(RUNS.c.id == self.id).values(done=self.done, total=self.total)
-        connection.execute(progress)
-
-    def _end(self, **values: Any) -> None:
-        with self.database.writing() as connection:
-            ended = {"done": self.done, "total": self.total, "finished": now(), **values}
-            connection.execute(sa.update(RUNS).where(RUNS.c.id == self.id).values(**ended))
+        mine = sa.update(RUNS).where(RUNS.c.id == self.id)
+        connection.execute(mine.values(done=self.done, total=self.total))
 
     def __exit__(self, *error: object) -> None:
         self._stop()
-        raised = error[1]
+        raised, mine = error[1], RUNS.c.id == self.id
+        if raised is None:
+            status, self.done = COMPLETE, self.total or self.done
+        else:
+            status = INTERRUPTED if isinstance(raised, Interrupted | KeyboardInterrupt) else FAILED
+        message = "" if raised is None else " ".join(str(raised).split())[:500]
+        end = {"status": status, "message": message, "finished": now(), "done": self.done, "total": self.total}
         try:
-            if self._was_refused(raised):  # nothing was done: an earlier row is still the one to resume
-                with self.database.writing() as connection:
-                    connection.execute(sa.delete(RUNS).where(RUNS.c.id == self.id))
-            elif raised is None:
-                self.done = self.total or self.done
-                self._end(status=COMPLETE)
-            else:
-                status = INTERRUPTED if isinstance(raised, Interrupted | KeyboardInterrupt) else FAILED
-                self._end(status=status, message=" ".join(str(raised).split())[:500])
+            # if nothing was done, an earlier row is still the one to resume
+            change = sa.delete(RUNS) if self._was_refused(raised) else sa.update(RUNS).values(**end)
+            with self.database.writing() as connection:
+                connection.execute(change.where(mine))
         except StorageError:
             if raised is None:  # otherwise show the first error
                 raise
@@ -228,13 +342,13 @@ def command_to_go_on(database: Database, kind: str, folder: Path) -> tuple[str, 
     Empty if the artifact is complete, or if the database has no row for it.
     """
     rows = run_rows(database, kind, _name_in(database, kind, folder))
-    return rows[0].command if rows and rows[0].status != COMPLETE else ()
+    return tuple(rows[0].command) if rows and rows[0].status != COMPLETE else ()
 
 
-def interrupted(database: Database, kind: str, command: Sequence[str]) -> RunRow | None:
-    """Return the newest row of a command (without `kerv`) if it did not complete."""
-    row = next((row for row in run_rows(database, kind) if row.command == tuple(command)), None)
-    return None if row is None or row.status == COMPLETE else row
+def interrupted(database: Database, kind: str, command: Sequence[str]) -> str:
+    """Return the name in the newest row of a command (without `kerv`) if it did not complete."""
+    row = next((row for row in run_rows(database, kind) if row.command == list(command)), None)
+    return "" if row is None or row.status == COMPLETE else str(row.name)
 
 
 def forget(database: Database, kind: str, name: str) -> None:

@@ -24,10 +24,8 @@ from kerv_cli.episodes.identity import Setting
 from kerv_cli.episodes.resolve import ResolvedStudy, located
 from kerv_cli.lab.database import EPISODES, RUNS, SETTINGS, STUDIES, UNFINISHED, WANTED, Database, now
 from kerv_cli.lab.plan import ALL, NEVER, Block, Episode, all_episodes, blocks_of, ordered_parts, split
-from kerv_cli.lab.presence import living
-from kerv_cli.lab.read import counts_of, is_stored, rows_of, setting_of, stored_episodes, swept_by
-from kerv_cli.lab.runs import interrupted
-from kerv_cli.lab.store import ABOUT, SWEEP, Study
+from kerv_cli.lab.runs import interrupted, living
+from kerv_cli.lab.store import ABOUT, SWEEP, Study, counts_of, row_of, rows_of, setting_of, stored_episodes, swept_by
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,10 +110,10 @@ def plan(
         _check_source(study, command)
     else:
         begun = interrupted(database, kind, command)
-        done, total = counts_of(replace(study, name=begun.name)) if begun else (0, 0)
-        begun = begun if 0 < done < total else None
-        study = replace(study, name=begun.name if begun else new_name(study))
-        rerun, runtime = NEVER if begun else ALL, replace(runtime, workers=1, launch="")
+        done, total = counts_of(replace(study, name=begun)) if begun else (0, 0)
+        is_resumed = 0 < done < total
+        study = replace(study, name=begun if is_resumed else new_name(study))
+        rerun, runtime = NEVER if is_resumed else ALL, replace(runtime, workers=1, launch="")
     return plan_study(study, rerun, runtime, command)
 
 
@@ -137,7 +135,7 @@ def new_name(study: Study) -> str:
     """Return a name for a new rollout, with date, time and methods: `20260301-142530-ar-spec_vla`."""
     methods = "-".join(dict.fromkeys(str(setting.settings["method"]) for setting in study.settings))
     name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{re.sub(r'[^A-Za-z0-9_.-]', '_', methods)[:32]}"
-    return f"{name}-{secrets.token_hex(2)}" if is_stored(replace(study, name=name)) else name
+    return f"{name}-{secrets.token_hex(2)}" if row_of(replace(study, name=name)) else name
 
 
 def plan_study(

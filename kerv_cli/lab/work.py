@@ -1,12 +1,12 @@
-"""A worker: claims a block of episodes, runs it, commits each episode when it ends, and claims the next.
+"""Workers, and the sweep that follows them until every episode of its plan has ended or failed.
 
-Within a block the settings take turns in one process, episode by episode. A worker that is killed loses at most the
-episodes that are running. Another worker runs the rest of its block.
+A worker claims a block of episodes, runs it, commits each episode when it ends, and claims the next. Within a block the
+settings take turns in one process, episode by episode. A worker that is killed loses at most the episodes that are
+running. Another worker runs the rest of its block.
 """
 
 from __future__ import annotations
 
-import itertools
 import os
 import secrets
 import time
@@ -24,20 +24,21 @@ from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.episodes.identity import ENGINE, OBSERVATION, Setting
 from kerv_cli.episodes.policy import artifacts_of, check
 from kerv_cli.episodes.rows import decodes_table, episode_row, seconds_blob, table_blob
-from kerv_cli.episodes.runner import Request, Runner, close_worlds, is_recorded, run_batch
-from kerv_cli.episodes.settings import RolloutSettings
+from kerv_cli.episodes.runner import Request, Runner, close_worlds, run_batch
 from kerv_cli.lab.database import now
 from kerv_cli.lab.plan import Block, Episode, seeds_text
-from kerv_cli.lab.presence import Presence, bury
 from kerv_cli.lab.queue import MOST_DEATHS, Claim, ClaimLost, Queue, patiently
-from kerv_cli.lab.read import loaded
-from kerv_cli.lab.store import Study
+from kerv_cli.lab.runs import Presence, Run, bury
+from kerv_cli.lab.store import Study, loaded, rows_of
+from kerv_cli.lab.study import Plan
 from kerv_cli.targets.provenance import stamp
 
 T = TypeVar("T")
 
 POLL_SECONDS = 1.0
 """Seconds between two queries of the queue while other processes run all blocks that are left."""
+FOLLOW_SECONDS = 0.3
+"""Seconds between two counts of the episodes that are left."""
 WAITING_SECONDS = 10.0
 """Seconds between two lines that say that a worker waits."""
 
@@ -52,21 +53,6 @@ Save = Callable[[EpisodeRecord, Path, str], object]
 
 
 @dataclass(frozen=True)
-class Started:
-    """A run of a study's missing episodes begins.
-
-    Attributes:
-        to_run: Number of episodes to run.
-        reused: Number of episodes that are in the database already.
-        load: Load average per core at the start. 0 if no episode is timed.
-    """
-
-    to_run: int
-    reused: int
-    load: float = 0.0
-
-
-@dataclass(frozen=True)
 class BlockStarted:
     """A worker has claimed a block (episodes that one process runs)."""
 
@@ -75,13 +61,7 @@ class BlockStarted:
 
 @dataclass(frozen=True)
 class Preparing:
-    """A worker builds the decoder of a setting, before it runs the setting's first episode in a block.
-
-    Attributes:
-        setting: The setting.
-        number: Position of the setting among the block's settings, from 1.
-        of: Number of settings in the block.
-    """
+    """A worker builds the decoder of a setting: the setting with this number among the `of` settings of a block."""
 
     setting: Setting
     number: int
@@ -98,20 +78,14 @@ class BlocksWait:
 
 @dataclass(frozen=True)
 class Counted:
-    """How many of a plan's episodes have neither ended nor failed, wherever they run."""
+    """How many of a study's episodes have neither ended nor failed, wherever they run."""
 
     left: int
 
 
 @dataclass(frozen=True)
 class EpisodeEnd:
-    """An episode has ended.
-
-    Attributes:
-        episode: The episode.
-        success: Whether the task was solved.
-        seconds: Wall time.
-    """
+    """An episode has ended, after `seconds` of wall time."""
 
     episode: Episode
     success: bool = False
@@ -135,8 +109,88 @@ class SettingFailed:
     episodes: tuple[Episode, ...] = ()
 
 
-Event = Started | BlockStarted | Preparing | BlocksWait | EpisodeEnd | SettingFailed | Counted
+Event = BlockStarted | Preparing | BlocksWait | EpisodeEnd | SettingFailed | Counted
 OnEvent = Callable[[Event], None]
+
+Tend = Callable[[int], object]
+"""Function to call again and again with the number of episodes that are left: it looks after the workers."""
+
+
+@dataclass
+class Outcome:
+    """Result of a plan. Each episode of the study is in exactly one of the first three lists.
+
+    Attributes:
+        done: Episodes that were missing and have been run, by this command or another.
+        reused: Episodes that were in the database already.
+        failed: Settings that failed, with their episodes.
+        seconds: Wall time.
+    """
+
+    done: list[Episode] = field(default_factory=list)
+    reused: list[Episode] = field(default_factory=list)
+    failed: list[SettingFailed] = field(default_factory=list)
+    seconds: float = 0.0
+
+
+def follow(plan: Plan, record: Run, tend: Tend, prepare: Prepare, on_event: OnEvent) -> Outcome:
+    """Wait until no episode of a saved plan is left. With one worker, this process is the worker.
+
+    Args:
+        plan: The plan.
+        record: The row of this command.
+        tend: What `workers` yields.
+        prepare: Builds a setting's decoder for a task. Used in this process only.
+        on_event: Called with each event, to show progress.
+    """
+    began, counted = time.perf_counter(), 0.0
+    queue = Queue(plan.study, record.worker, record.id)
+
+    def left() -> int:
+        nonlocal counted
+        waiting, counted = patiently(queue.left, plan.study), time.monotonic()
+        on_event(Counted(waiting))
+        record.beat(max(0, len(plan.to_run) - waiting))
+        return waiting
+
+    def see(event: Event) -> None:
+        on_event(event)
+        if isinstance(event, EpisodeEnd) and time.monotonic() - counted > FOLLOW_SECONDS:
+            left()
+
+    if plan.runtime.workers == 1 and not plan.is_elsewhere:
+        work(queue, prepare, see, lambda: not left())
+    told = time.monotonic()
+    while waiting := left():
+        tend(waiting)
+        if time.monotonic() - told > WAITING_SECONDS:
+            told = time.monotonic()
+            if not patiently(queue.has_workers):
+                on_event(BlocksWait(waiting, has_workers=False))
+        time.sleep(FOLLOW_SECONDS)
+    return _outcome(plan, time.perf_counter() - began)
+
+
+def _outcome(plan: Plan, seconds: float) -> Outcome:
+    study, outcome = plan.study, Outcome(seconds=seconds)
+    with study.database.reading() as connection:
+        rows = {(row.label, row.task, row.seed): row for row in rows_of(connection, study.name)}
+    if not rows:
+        raise KervError(f"study {study.name} was deleted while it ran: run the same command to start it again")
+    failed, shown = dict[Any, dict[Episode, None]](), {one.key: one for one in plan.missing}
+    for one in study.episodes:
+        row = rows.get((one.setting.label, one.task, one.seed))
+        if row is None or row.episode_id is None:
+            error = (row and row.error) or "another command took it out of the study: run the same command again"
+            failed.setdefault((one.setting.work, one.task, error), {})[one] = None
+        elif one in plan.existing:
+            outcome.reused.append(one)
+        elif shown.get(one.key, one) is one:  # an episode that several labels share ran once
+            outcome.done.append(one)
+    for (_, _, error), episodes in failed.items():
+        reason, _, trace = error.partition("\n")
+        outcome.failed.append(SettingFailed(reason, trace, episodes=tuple(episodes)))
+    return outcome
 
 
 def work_on(study: Study, run: str, on_event: OnEvent, save: Save) -> None:
@@ -170,15 +224,13 @@ def checked(setting: Setting, tasks: list[str], results: str, is_awaited: bool =
     for kind in setting.identity.keys() | identity.keys():
         before, after = setting.identity.get(kind, "none"), identity.get(kind, "none")
         if kind != OBSERVATION and before != after:
-            where = f": {_path_of(here.on(*tasks), kind)}" if kind in ("target", *ArtifactPart.every()) else ""
+            artifacts = artifacts_of(here.on(*tasks))
+            path = (
+                artifacts.folder if kind == "target" else artifacts.path(kind) if kind in ArtifactPart.every() else ""
+            )
             changed = f"has changed from {before[:12]} to {after[:12]} since it was planned"
-            raise CheckpointError(f"the {kind} of {setting.label} {changed}{where}")
+            raise CheckpointError(f"the {kind} of {setting.label} {changed}: {path}".removesuffix(": "))
     return replace(here, identity=identity)
-
-
-def _path_of(settings: RolloutSettings, kind: str) -> Path:
-    artifacts = artifacts_of(settings)
-    return artifacts.folder if kind == "target" else artifacts.path(kind)
 
 
 def work(
@@ -199,7 +251,7 @@ def work(
         is_done: Says whether to end before all blocks have ended.
     """
     load, told = load_per_core(), 0.0
-    with queue.database.kept_open():
+    with queue.database.reading():  # a SQLite file that stays open is not flushed after every transaction
         while not is_done():
             claim = patiently(queue.claim)
             if claim is not None:
@@ -232,6 +284,7 @@ class _Attempt:
         started: Time at which the block began (ISO 8601).
         left: Episodes that have neither ended nor failed, in the order in which they run.
         running: The episode that the database knows to be running.
+        order: Number of episodes that have ended.
     """
 
     queue: Queue
@@ -242,42 +295,23 @@ class _Attempt:
     started: str = field(default_factory=now)
     left: list[Episode] = field(default_factory=list)
     running: Episode | None = None
+    order: int = 0
 
     def run(self) -> None:
         """Run the block, until it has ended or its claim is lost."""
-        block, runners = self.claim.block, dict[str, RunEpisode]()
+        block = self.claim.block
         self.left = list(block.turns())
         self.id = f"{self.claim.run}-{secrets.token_hex(4)}"
         try:
             if self.claim.deadly is not None:
                 self._fail(self.claim.deadly, SettingFailed(f"{MOST_DEATHS} workers died in this episode"))
-            if not self.left:
-                return
-            self.on_event(BlockStarted(block))
-            if block.batch > 1:
-                self._run_batch()
-                return
-            for number, setting in enumerate(block.settings, 1):
-                first = next((one for one in self.left if one.setting.work == setting.work), None)
-                if first is None:
-                    continue
-                self.on_event(Preparing(setting, number, len(block.settings)))
-                self._begin(first)
-                try:
-                    runners[setting.work] = self.prepare(setting, first.task)
-                except Exception as error:  # noqa: BLE001 - the other settings go on
-                    self._fail(first, failure_of(error))
-            for order, one in enumerate(list(self.left)):
-                if one not in self.left:
-                    continue
-                self._begin(one)
-                started = datetime.now(UTC)
-                try:
-                    record = runners[one.setting.work](one.seed)
-                except Exception as error:  # noqa: BLE001 - the other settings go on
-                    self._fail(one, failure_of(error))
-                else:
-                    self._end(one, record, order, started)
+            if self.left:
+                self.on_event(BlockStarted(block))
+                for one, result, started in self._together() if block.batch > 1 else self._in_turn():
+                    if isinstance(result, Exception):
+                        self._fail(one, failure_of(result))
+                    elif one in self.left:
+                        self._end(one, result, started)
         except ClaimLost:  # another worker has it, because this one was silent for too long: it did not die
             if self.running is not None:
                 patiently(self.queue.survive, self.running)
@@ -287,26 +321,41 @@ class _Attempt:
             patiently(self.queue.begin, one, self.running)
             self.running = one
 
-    def _run_batch(self) -> None:
-        together = self.prepare.together  # type: ignore[attr-defined]
-        order = itertools.count()
+    def _in_turn(self) -> Iterator[tuple[Episode, EpisodeRecord | Exception, datetime]]:
+        runners, settings = dict[str, RunEpisode](), self.claim.block.settings
+        for number, setting in enumerate(settings, 1):
+            first = next((one for one in self.left if one.setting.work == setting.work), None)
+            if first is not None:
+                self.on_event(Preparing(setting, number, len(settings)))
+                self._begin(first)
+                try:
+                    runners[setting.work] = self.prepare(setting, first.task)
+                except Exception as error:  # noqa: BLE001 - the other settings go on
+                    yield first, error, datetime.now(UTC)
+        for one in list(self.left):
+            if one in self.left:
+                self._begin(one)
+                started = datetime.now(UTC)
+                result: EpisodeRecord | Exception
+                try:
+                    result = runners[one.setting.work](one.seed)
+                except Exception as error:  # noqa: BLE001 - the other settings go on
+                    result = error
+                yield one, result, started
+
+    def _together(self) -> Iterator[tuple[Episode, EpisodeRecord | Exception, datetime]]:
         self._begin(self.left[0])
         try:
-            for one, result in together(list(self.left)):
-                if isinstance(result, Exception):
-                    self._fail(one, failure_of(result))
-                elif one in self.left:
-                    started = datetime.now(UTC) - timedelta(seconds=result.wall_seconds)
-                    self._end(one, result, next(order), started)
-        except (ClaimLost, StorageError):
-            raise
+            for one, result in self.prepare.together(list(self.left)):  # type: ignore[attr-defined]
+                seconds = 0.0 if isinstance(result, Exception) else result.wall_seconds
+                yield one, result, datetime.now(UTC) - timedelta(seconds=seconds)
         except Exception as error:  # noqa: BLE001 - the other blocks go on
-            while self.left:
-                self._fail(self.left[0], failure_of(error))
+            for one in list(self.left):
+                yield one, error, datetime.now(UTC)
 
-    def _end(self, one: Episode, record: EpisodeRecord, order: int, started: datetime) -> None:
+    def _end(self, one: Episode, record: EpisodeRecord, started: datetime) -> None:
         row = episode_row(record) | {
-            "order": order,
+            "order": self.order,
             "started": started.isoformat(timespec="milliseconds"),
             "decode_seconds": seconds_blob(decode.seconds for decode in record.decodes),
         }
@@ -316,6 +365,7 @@ class _Attempt:
         patiently(self.queue.write, one, self._row(), row, decodes, then)
         self.running = then if is_next else self.running
         self.left.remove(one)
+        self.order += 1
         self.on_event(EpisodeEnd(one, bool(row["success"]), float(row["wall_seconds"])))
 
     def _row(self) -> dict[str, Any]:
@@ -364,15 +414,10 @@ class EpisodeRunner:
     save: Save
 
     def __call__(self, setting: Setting, task: str) -> RunEpisode:
-        runner = _loaded(setting, [task], lambda: Runner(setting.on(task), task))
+        def save(record: EpisodeRecord) -> None:
+            self.save(record, self.rollouts / Episode(setting, record.task, record.seed).recording, setting.label)
 
-        def run_episode(seed: int) -> EpisodeRecord:
-            record = runner.episode(seed, is_recorded(runner.settings, seed))
-            if record.frames:
-                self.save(record, self.rollouts / Episode(setting, record.task, seed).recording, setting.label)
-            return replace(record, frames={}, places={})
-
-        return run_episode
+        return _loaded(setting, [task], lambda: Runner(setting.on(task), task, save)).episode
 
     def together(self, episodes: Sequence[Episode]) -> Iterator[tuple[Episode, EpisodeRecord | Exception]]:
         """Run episodes of one setting, `rollout.batch` at a time.

@@ -1,4 +1,4 @@
-"""Workers of a sweep, which are processes of `kerv work`: on this machine, or wherever a command starts them.
+"""A command that runs a plan, and its workers: processes of `kerv work` here, or wherever a command starts them.
 
 Workers on this machine end when the sweep ends, even if the sweep is killed. Others end when no block is left.
 """
@@ -12,6 +12,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,12 +21,26 @@ from typing import IO, Any
 import sqlalchemy as sa
 
 from kerv_cli.base.config import as_overrides
-from kerv_cli.base.errors import KervError
+from kerv_cli.base.durations import count
+from kerv_cli.base.errors import Interrupted, KervError, StorageError, UsageError
+from kerv_cli.episodes.runner import close_worlds
 from kerv_cli.lab.command import STORE
-from kerv_cli.lab.database import PLANNED, STUDIES, UNFINISHED, WANTED, Database
-from kerv_cli.lab.presence import bury
-from kerv_cli.lab.queue import patiently
-from kerv_cli.lab.study import Plan
+from kerv_cli.lab.database import EPISODES, Database
+from kerv_cli.lab.queue import MOST_DEATHS, patiently
+from kerv_cli.lab.runs import Run, bury
+from kerv_cli.lab.store import ROLLOUT, counts_of
+from kerv_cli.lab.study import Plan, save, withdraw
+from kerv_cli.lab.work import (
+    Counted,
+    EpisodeRunner,
+    Event,
+    OnEvent,
+    Outcome,
+    Save,
+    SettingFailed,
+    Tend,
+    follow,
+)
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 """Environment variables with the number of CPU threads of numerical libraries.
@@ -34,8 +49,59 @@ The libraries read them when they load, before torch.set_num_threads can be call
 """
 GPUS = "CUDA_VISIBLE_DEVICES"
 
-MOST_STILLBORN = 3
-"""After this many workers in a row have died before they claimed a block, the sweep ends."""
+
+@contextlib.contextmanager
+def begun(plan: Plan) -> Iterator[Run]:
+    """Write the row of a command that runs a plan, for a `with` block.
+
+    If the block raises an exception, what nobody runs is not asked for any more.
+    """
+    study = plan.study
+    with Run(study.database, study.kind, study.name, plan.command, len(plan.to_run), study.kind == ROLLOUT) as run:
+        try:
+            yield run
+        except BaseException as error:
+            if not isinstance(error, UsageError):  # that is, the plan was not saved
+                with contextlib.suppress(StorageError):
+                    withdraw(plan, run.id)
+            if not isinstance(error, KeyboardInterrupt):
+                raise
+            again = (
+                "run the same command without rerun=all"
+                if plan.anew and study.kind != ROLLOUT
+                else "run the same command"
+            )
+            raise Interrupted(f"interrupted: {_kept(plan)} of {study.name} are kept: {again} to resume") from None
+        finally:
+            close_worlds()
+
+
+def run(plan: Plan, on_event: OnEvent = lambda event: None, *, write: Save = lambda *_: None) -> Outcome:
+    """Save a plan, and run its missing episodes. Each episode is in the database as soon as it ends.
+
+    Args:
+        plan: The plan.
+        on_event: Called with each event, to show progress.
+        write: Writes the recording (.rrd file) of an episode. The default writes nothing.
+    """
+
+    def forward(event: Event) -> None:
+        if isinstance(event, SettingFailed) and plan.study.kind == ROLLOUT:
+            raise event.error or KervError(event.reason)
+        on_event(event)
+
+    with begun(plan) as record:
+        save(plan, record.id)
+        with workers(plan, record.id) as tend:
+            return follow(plan, record, tend, EpisodeRunner(plan.study.rollouts, write), forward)
+
+
+def _kept(plan: Plan) -> str:
+    try:
+        done, total = counts_of(plan.study)
+        return f"{done} of {count(total or len(plan.study.episodes), 'episode')}"  # its plan may not be written yet
+    except StorageError:
+        return "all complete episodes"
 
 
 def work_command(database: Database, study: str, **settings: str) -> str:
@@ -62,7 +128,7 @@ def gpus_in_turn(plan: Plan) -> list[str]:
 
 
 @contextlib.contextmanager
-def workers(plan: Plan, run: str, say: Callable[[str], object] = lambda line: None) -> Iterator[Callable[[], object]]:
+def workers(plan: Plan, run: str, say: Callable[[str], object] = lambda line: None) -> Iterator[Tend]:
     """Start the workers of a plan for a `with` block.
 
     Args:
@@ -71,7 +137,7 @@ def workers(plan: Plan, run: str, say: Callable[[str], object] = lambda line: No
         say: Prints a line.
 
     Yields:
-        A function to call again and again. It frees what killed workers had claimed, and replaces them.
+        A function for `follow`. It frees what killed workers had claimed, and replaces them.
     """
     runtime, study = plan.runtime, plan.study
     # a cluster's jobs find `kerv` where this process runs, also when its folder is not on the user's PATH
@@ -84,7 +150,7 @@ def workers(plan: Plan, run: str, say: Callable[[str], object] = lambda line: No
         else:
             say(f"start workers, as many as you like: {line}")
     if not plan.blocks or plan.is_elsewhere or runtime.workers == 1:
-        yield lambda: patiently(bury, study.database)
+        yield lambda left: patiently(bury, study.database)
         return
     threads = max((one.setting.settings["runtime"]["threads"] for one in plan.to_run), default=1)
     environment |= dict.fromkeys(THREAD_VARIABLES, str(threads))
@@ -100,19 +166,16 @@ def _launch(line: str, environment: dict[str, str]) -> None:
         raise KervError(f"runtime.launch: {line} failed: {said}")
 
 
-def last_line(text: str) -> str:
-    return text.strip().rpartition("\n")[2].strip()
-
-
 @dataclass
 class _Worker:
     process: subprocess.Popen[bytes]
     log: IO[bytes]
     gpu: str
 
-    def last_line(self) -> str:
-        self.log.seek(0)
-        return last_line(self.log.read().decode(errors="replace"))
+    def close(self) -> None:
+        self.process.kill()
+        self.process.communicate()
+        self.log.close()
 
 
 class LocalWorkers:
@@ -139,15 +202,14 @@ class LocalWorkers:
         environment: dict[str, str],
         gpus: Sequence[str] = (),
     ) -> None:
-        self.database, self.study, self._environment = database, study, environment
-        self._stillborn, self._progress = 0, (0, 0)
+        self.database, self._environment = database, environment
         words = as_overrides(study=study, results=str(database.results.absolute()), run=run)
         self._words = [sys.executable, "-m", "kerv_cli", "work", *words]
         self._gpus = list(itertools.islice(itertools.cycle(gpus or [""]), number))
         self._workers: list[_Worker] = []
+        self._left = self._killed = 0
 
     def __enter__(self) -> LocalWorkers:
-        self._progress = self._read_progress()
         self._workers = list(map(self._started, self._gpus))
         return self
 
@@ -155,44 +217,57 @@ class LocalWorkers:
         for worker in self._workers:
             worker.process.kill()
         for worker in self._workers:
-            worker.process.wait()
-            self._close(worker)
+            worker.close()
         with contextlib.suppress(KervError):
             bury(self.database)
 
-    def _read_progress(self) -> tuple[int, int]:
-        begun = sa.func.coalesce(sa.func.sum(WANTED.c.attempts), 0)
-        query = sa.select(sa.func.count(), begun).select_from(PLANNED)
-        with self.database.reading() as connection:
-            left, number = connection.execute(query.where(STUDIES.c.name == self.study, UNFINISHED)).one()
-        return int(left), int(number)
-
     def _started(self, gpu: str) -> _Worker:
         environment = self._environment | ({GPUS: gpu} if gpu else {})
-        log = tempfile.TemporaryFile()  # noqa: SIM115 - `_close` closes it
+        log = tempfile.TemporaryFile()  # noqa: SIM115 - `close` closes it
         streams: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": log}
         return _Worker(subprocess.Popen(self._words, env=environment, **streams), log, gpu)
 
-    @staticmethod
-    def _close(worker: _Worker) -> None:
-        if worker.process.stdin is not None:
-            worker.process.stdin.close()
-        worker.log.close()
-
-    def tend(self) -> None:
-        """Free what killed workers had claimed, and replace them."""
+    def tend(self, left: int) -> None:
+        """Free what killed workers had claimed, and replace them. `left`: number of episodes that have not ended."""
         patiently(bury, self.database)
         for at, worker in enumerate(self._workers):
             code = worker.process.poll()
             if code is None or code == 0:
                 continue
             if code not in (130, 137) and code > 0:
-                line = worker.last_line().removeprefix("kerv: ")
-                raise KervError(f"a worker process ended: {line or f'exit code {code}'}")
-            before, self._progress = self._progress, patiently(self._read_progress)
-            self._stillborn = self._stillborn + 1 if before == self._progress else 0
-            if self._stillborn >= MOST_STILLBORN:
-                raise KervError(f"{self._stillborn} worker processes were killed before they ran a block: "
+                worker.log.seek(0)
+                line = worker.log.read().decode(errors="replace").strip().rpartition("\n")[2].strip()
+                raise KervError(f"a worker process ended: {line.removeprefix('kerv: ') or f'exit code {code}'}")
+            self._left, self._killed = left, self._killed + 1 if left == self._left else 1
+            # an episode in which MOST_DEATHS workers die fails, and is not left any more
+            if self._killed > MOST_DEATHS * len(self._workers):
+                raise KervError(f"{self._killed} worker processes were killed and no episode has ended: "
                                 "is there enough memory for them? try runtime.workers=1")  # fmt: skip
-            self._close(worker)
+            worker.close()
             self._workers[at] = self._started(worker.gpu)
+
+
+class TimeLeft:
+    """Estimates how long the missing episodes of a plan take: at first from stored episodes, then from their pace.
+
+    Args:
+        plan: The plan.
+        guess: Seconds per episode if none of the study's settings has a stored one.
+    """
+
+    def __init__(self, plan: Plan, guess: float) -> None:
+        works = {setting.work for setting in plan.study.settings}
+        query = sa.select(sa.func.avg(EPISODES.c.wall_seconds), sa.func.count(EPISODES.c.wall_seconds))
+        with plan.study.database.reading() as connection:
+            mean, stored = connection.execute(query.where(EPISODES.c.work.in_(works))).one()
+        self.plan, self._began = plan, time.monotonic()
+        self.seconds = len(plan.to_run) * (mean or guess) / max(1, min(plan.runtime.workers, len(plan.blocks)))
+        self.source = (
+            f"measured on {count(stored, 'stored episode')}" if stored else f"a guess of {guess:g} s per episode"
+        )
+
+    def see(self, event: Event) -> None:
+        """Correct the estimate by the number of episodes that are left."""
+        total = len(self.plan.to_run)
+        if isinstance(event, Counted) and event.left < total:
+            self.seconds = (time.monotonic() - self._began) * event.left / (total - event.left)

@@ -23,8 +23,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_json, write_text
 from kerv_cli.episodes.identity import NOT_DETERMINING, without
 from kerv_cli.lab.database import Database
-from kerv_cli.lab.read import counts_of, studies, sweep_command
-from kerv_cli.lab.store import ROLLOUT, SWEEP, Study
+from kerv_cli.lab.store import ROLLOUT, SWEEP, Study, counts_of, studies, sweep_command
 from kerv_cli.report.measures import Measures, Result, Row, columns_of, csv_text
 from kerv_cli.report.plots import about, acceptance_figure, library, study_figures
 from kerv_cli.report.profiles import NamedProfile, open_profiles

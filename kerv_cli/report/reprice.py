@@ -19,7 +19,7 @@ import pyarrow.compute as pc
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.episodes.cost import COUNTED, READ_PHASES, Profile, Work, prices, read_profile, work_of
-from kerv_cli.lab.read import decodes_of
+from kerv_cli.lab.store import decodes_of
 from kerv_cli.report.measures import Measures, Result, Row, columns_of, measure, paired, speedups
 from kerv_cli.report.profiles import NamedProfile, open_profiles
 from kerv_cli.report.tables import StudyData

@@ -17,8 +17,7 @@ import pandas as pd
 from kerv_cli.base.errors import UsageError
 from kerv_cli.episodes.identity import NOT_DETERMINING, OBSERVATION, Plain, Setting, flat, stress_of, without
 from kerv_cli.lab.plan import Episode, seeds_text
-from kerv_cli.lab.read import decodes_of, frame_of, how_to_run, loaded, whole_runs
-from kerv_cli.lab.store import Study
+from kerv_cli.lab.store import Study, decodes_of, frame_of, how_to_run, loaded, whole_runs
 from kerv_cli.report.measures import (
     OVERALL,
     PER_TASK,

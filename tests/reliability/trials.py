@@ -32,7 +32,7 @@ import studies_synthetic as synthetic
 from kerv_cli.base.errors import CheckpointError, KervError
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.lab import database as tables
-from kerv_cli.lab import follow, presence, queue, work
+from kerv_cli.lab import queue, runs, work, workers
 from kerv_cli.lab.database import BLOCKS, EPISODES, RUNS, SETTINGS, STUDIES, UNFINISHED, WANTED, WORKERS, Database
 from kerv_cli.lab.store import Study, remove_study
 
@@ -125,8 +125,8 @@ class Trial:
 
     def _in_child(self, name: str, job: Callable[[Trial], object]) -> int:
         tables._server.cache_clear()  # a connection belongs to one process
-        presence.LAPSE_SECONDS, presence.BEAT_SECONDS = LAPSE, BEAT
-        work.POLL_SECONDS, follow.FOLLOW_SECONDS, queue.PATIENCE_SECONDS = 0.05, 0.05, 20.0
+        runs.LAPSE_SECONDS, runs.BEAT_SECONDS = LAPSE, BEAT
+        work.POLL_SECONDS, work.FOLLOW_SECONDS, queue.PATIENCE_SECONDS = 0.05, 0.05, 20.0
         random.seed(os.getpid())
         try:
             job(self)
@@ -155,9 +155,9 @@ class Trial:
 
             command = ["sweep", f"study={study.name}"]
             plan = synthetic.planned(trial.database(), study, rerun, runtime=RuntimeSettings(), command=command)
-            with follow.begun(plan) as record:
-                follow.save(plan, record.id)
-                outcome = follow.follow(plan, record, lambda: None, trial.prepare, on_event)
+            with workers.begun(plan) as record:
+                workers.save(plan, record.id)
+                outcome = work.follow(plan, record, lambda left: None, trial.prepare, on_event)
             failed = sum(len(failure.episodes) for failure in outcome.failed)
             told = {"study": study.name, "planned": len(study.episodes), "done": len(outcome.done),
                     "reused": len(outcome.reused), "failed": failed, "quiet": quiet, "pid": os.getpid()}  # fmt: skip
@@ -170,7 +170,7 @@ class Trial:
 
         def job(trial: Trial) -> None:
             database = trial.database()
-            with presence.Presence(database) as here:
+            with runs.Presence(database) as here:
                 work.work(queue.Queue(Study(database, name), here.worker), trial.prepare)
 
         return job
@@ -182,7 +182,7 @@ class Trial:
             for _ in range(4):
                 time.sleep(0.15)
                 remove_study(Study(trial.database(), study.name))
-                follow.save(synthetic.planned(trial.database(), study))
+                workers.save(synthetic.planned(trial.database(), study))
 
         return job
 
