@@ -217,29 +217,6 @@ def count_calls() -> tuple[Prepare, list[str]]:
     return counted, calls
 
 
-class Odd(Exception):
-    """Cannot be pickled back: its arguments are not its message."""
-
-    def __init__(self, a: int, b: int) -> None:
-        super().__init__(f"{a} and {b}")
-
-
-def misbehave(setting: Setting, task: str) -> RunEpisode:
-    """Kills its process in its second episode, raises, or reports its process's thread number as wall seconds,
-    depending on r."""
-
-    def run(seed):
-        r = setting.settings["threshold"]["r"]
-        if r == 1 and seed > setting.settings["seed"]:
-            os.kill(os.getpid(), signal.SIGKILL)
-        if r == 5:
-            raise Odd(1, 2)
-        time.sleep(0.02)
-        return replace(episode(setting, task, seed), wall_seconds=float(os.environ["OMP_NUM_THREADS"]))
-
-    return run
-
-
 def unhurried(setting: Setting, task: str) -> RunEpisode:
     """A tenth of a second for each episode."""
 

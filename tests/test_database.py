@@ -108,6 +108,11 @@ def test_a_failed_transaction_leaves_nothing(database):
     with refused("nowhere", error=StorageError), database.writing() as connection:
         connection.execute(sa.delete(STUDIES))
         connection.execute(sa.text("SELECT * FROM nowhere"))
+    with pytest.raises(KeyboardInterrupt), database.writing() as connection:  # noqa: PT012
+        try:
+            raise KeyboardInterrupt
+        finally:  # as a driver may fail to roll back what Ctrl-C has left
+            connection.execute(sa.text("SELECT * FROM nowhere"))
     assert count(database, STUDIES) == 1
 
 
@@ -162,7 +167,7 @@ def test_tables_of_another_kerv_are_refused(database, monkeypatch, schema, messa
         begun(opened(database.results), "b")
 
 
-@pytest.mark.parametrize("harm", ["no database", "cut", "changed", "bits", "empty", "a folder"])
+@pytest.mark.parametrize("harm", ["cut", "changed", "bits", "empty", "a folder"])
 def test_a_damaged_file_is_one_line(tmp_path, harm):
     swept(tmp_path, STUDY)
     path = tmp_path / FILE
@@ -172,7 +177,7 @@ def test_a_damaged_file_is_one_line(tmp_path, harm):
         path.mkdir()
     else:
         path.write_bytes({
-            "no database": b"kerv" * 5000, "cut": content[:6000], "empty": b"",
+            "cut": content[:6000], "empty": b"",
             "changed": content[:4096] + bytes(len(content) - 4096),
             "bits": content.replace(b"CREATE TABLE runs", b"CREATE TABL\xc5 runs"),
         }[harm])  # fmt: skip
@@ -249,7 +254,7 @@ def test_a_suspended_transaction_lets_others_write(database, monkeypatch):
         suspended.scalar(number)
 
 
-@pytest.mark.parametrize("version", ["'x'", "''", "-1", "0", "'1.5'", "x'31'", "'٣'", "99999999999999999999"])
+@pytest.mark.parametrize("version", ["'x'", "x'31'", "99999999999999999999"])
 def test_an_odd_schema_version_is_one_line(tmp_path, version):
     begun(opened(tmp_path), "a")
     change(tmp_path, f"UPDATE kerv SET value = {version}")
@@ -259,10 +264,8 @@ def test_an_odd_schema_version_is_one_line(tmp_path, version):
 @pytest.mark.parametrize(
     "row",
     [
-        "runs.command = '{'", "runs.message = CAST(x'ff' AS TEXT)", "studies.about = '{\"other\": 1}'",
-        "settings.identity = x'ff'",
-        "settings.identity = '{\"target\": 5}'", "episodes.decode_seconds = x'ff'", "episodes.steps = 'x'",
-        "episodes.initial_state = '{'", "blocks.about = '['",
+        "runs.message = CAST(x'ff' AS TEXT)", "studies.about = '{\"other\": 1}'",
+        "settings.identity = '{\"target\": 5}'", "episodes.decode_seconds = x'ff'", "episodes.initial_state = '{'",
     ],
 )  # fmt: skip
 def test_a_damaged_row_is_one_line(damageable, tmp_path, row):
@@ -276,7 +279,7 @@ def test_a_damaged_row_is_one_line(damageable, tmp_path, row):
     assert all("internal error" not in run.output for run in refusals)
 
 
-@pytest.mark.parametrize("name", ["a?b", "a%20b", "a#b", "mode=ro"])
+@pytest.mark.parametrize("name", ["a?b%20c#d", "mode=ro"])
 def test_a_results_folder_may_have_any_name(tmp_path, monkeypatch, name):
     monkeypatch.delenv(STORE, raising=False)
     begun(opened(tmp_path / name), "a")

@@ -127,6 +127,7 @@ def test_a_study_is_counted_before_it_is_planned():
         all_episodes([large], ["reach-v3"])
 
 
+@on_sqlite
 def test_more_episodes_run_only_the_new_seeds_in_turn(database):
     swept(database.results, threshold_study(TASKS, episodes=3, radii=(3,)))
     study = threshold_study(TASKS, episodes=5, radii=(3,))
@@ -156,6 +157,7 @@ def test_sweeps_over_other_tasks_end_in_one_study(database):
     }  # fmt: skip
 
 
+@on_sqlite
 def test_another_study_runs_only_what_it_does_not_share(database):
     store, _ = swept(database.results, threshold_study(["reach-v3"]))
     settings = {"renamed": settings_of("spec_vla", 3), "ar": settings_of("ar"), "new": settings_of("spec_vla", 15)}
@@ -189,6 +191,7 @@ def test_times_of_other_blocks_are_no_ratio_until_they_are_taken_in_turn(databas
     assert not_in_turn(load_study(store).results) == []
 
 
+@on_sqlite
 def test_a_rerun_keeps_the_older_measurement(database):
     study = threshold_study(["reach-v3"])
     store, _ = swept(database.results, study)
@@ -203,12 +206,15 @@ def test_a_rerun_keeps_the_older_measurement(database):
 def test_an_interrupted_rerun_goes_on_without_rerun(database):
     """The same command with rerun=all begins anew."""
     study = threshold_study(["reach-v3"])
-    swept(database.results, study)
+    store, _ = swept(database.results, study)
+    first = set(frame_of(store)["episode"])
     with pytest.raises(Interrupted, match="run the same command without rerun=all to resume"):
         swept(database.results, study, raising(KeyboardInterrupt(), seeds=[100_002]), rerun="all")
     rest = {(label, "reach-v3"): ([100_002, 100_003], "rerun=all") for label in study.labels}
     assert to_run(planned(database, study)) == rest
     assert len(planned(database, study, "all").missing) == 16
+    swept(database.results, study)
+    assert first.isdisjoint(frame_of(store)["episode"])
 
 
 @on_sqlite

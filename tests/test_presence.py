@@ -64,11 +64,11 @@ except UsageError as error:
 """
 
 
-@pytest.mark.parametrize("apart", [[], ["unshare", "--pid", "--fork"]])
-def test_only_one_process_makes_an_artifact(tmp_path, apart):
+def test_only_one_process_makes_an_artifact(tmp_path):
     """Also in another container with the same host name, where process ids mean something else."""
-    if apart and subprocess.run([*apart, "true"], capture_output=True, check=False).returncode:
-        pytest.skip("no right to make a namespace here")
+    apart = ["unshare", "--pid", "--fork"]
+    if not shutil.which("unshare") or subprocess.run([*apart, "true"], capture_output=True, check=False).returncode:
+        apart = []  # no right to make a namespace here
     command = [*apart, sys.executable, "-c", MAKES, str(tmp_path)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 

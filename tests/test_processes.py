@@ -63,7 +63,7 @@ def run():
     sys.unraisablehook = lambda _: None  # kerv would end
     insert(lab.Database(sys.argv[1]), "all is imported")
     signal.signal(signal.SIGVTALRM, lambda *_: signal.raise_signal(signal.SIGINT))
-    for trial in range(80):
+    for trial in range(30):
         database, kerv._is_interrupted = lab.Database(sys.argv[1]), False
         try:
             signal.setitimer(signal.ITIMER_VIRTUAL, random.uniform(1e-4, 6e-3))

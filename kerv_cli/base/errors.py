@@ -56,6 +56,13 @@ class Interrupted(KervError):
     exit_code = 130
 
 
+def is_of_an_interrupt(error: BaseException | None) -> bool:
+    """Return whether Ctrl-C caused an error: libraries can turn it into an error of their own."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
 class EpisodeError(KervError):
     """One episode failed, for example by a wrong answer of a server. Other episodes of its setting go on."""
 

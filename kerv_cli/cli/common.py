@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 import typer
 
 from kerv_cli.base.durations import duration
-from kerv_cli.base.errors import Interrupted, KervError, UsageError
+from kerv_cli.base.errors import Interrupted, KervError, UsageError, is_of_an_interrupt
 from kerv_cli.base.limits import description
 from kerv_cli.base.settings import CommandSettings
 
@@ -100,7 +100,7 @@ def one_line_errors(words: Sequence[str]) -> Iterator[None]:
     except (typer.Exit, typer.Abort):
         raise
     except KervError as error:
-        if isinstance(error, UsageError) and _is_of_an_interrupt(error):
+        if isinstance(error, UsageError) and is_of_an_interrupt(error):
             _refuse("interrupted", Interrupted.exit_code, None)
         _refuse(str(error), error.exit_code, error, words)
     except typer.TyperException as error:
@@ -116,13 +116,6 @@ def one_line_errors(words: Sequence[str]) -> Iterator[None]:
         _refuse(f"{error.strerror or error}: {error.filename or ''}".rstrip(": "), 1, error)
     except Exception as error:  # noqa: BLE001 - a user never sees a traceback
         _refuse(f"internal error, {type(error).__name__}: {error}; set KERV_TRACEBACK=1 to see where", 1, error)
-
-
-def _is_of_an_interrupt(error: BaseException | None) -> bool:
-    # OmegaConf can turn Ctrl-C into an error of its own
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or error.__context__
-    return error is not None
 
 
 def _parse_error(error: Any, words: Sequence[str]) -> str:

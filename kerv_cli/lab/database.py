@@ -18,7 +18,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from kerv_cli.base.errors import CheckpointError, KervError, StorageError, UsageError
+from kerv_cli.base.errors import CheckpointError, KervError, StorageError, UsageError, is_of_an_interrupt
 from kerv_cli.base.files import storage_errors
 from kerv_cli.base.paths import results_dir
 from kerv_cli.episodes.rows import EPISODE_SCHEMA, FLAG, FLOAT, INT
@@ -258,6 +258,8 @@ class Database:
         try:
             yield
         except sa.exc.DBAPIError as error:
+            if is_of_an_interrupt(error):  # the driver could not roll back what Ctrl-C has left
+                raise KeyboardInterrupt from error
             raise self._explained(error) from error
         except (Damaged, json.JSONDecodeError, UnicodeDecodeError) as error:
             raise self._damaged(error) from error
