@@ -28,7 +28,7 @@ from kerv_cli.lab.command import STORE
 from kerv_cli.lab.database import EPISODES, Database
 from kerv_cli.lab.queue import MOST_DEATHS, patiently
 from kerv_cli.lab.runs import Run, bury
-from kerv_cli.lab.store import ROLLOUT, counts_of
+from kerv_cli.lab.store import ROLLOUT
 from kerv_cli.lab.study import Plan, save, withdraw
 from kerv_cli.lab.work import (
     Counted,
@@ -66,12 +66,9 @@ def begun(plan: Plan) -> Iterator[Run]:
                     withdraw(plan, run.id)
             if not isinstance(error, KeyboardInterrupt):
                 raise
-            again = (
-                "run the same command without rerun=all"
-                if plan.anew and study.kind != ROLLOUT
-                else "run the same command"
-            )
-            raise Interrupted(f"interrupted: {_kept(plan)} of {study.name} are kept: {again} to resume") from None
+            kept = f"{len(plan.existing) + run.done} of {count(len(study.episodes), 'episode')} of {study.name}"
+            again = "the same command" + (" without rerun=all" if plan.anew and study.kind != ROLLOUT else "")
+            raise Interrupted(f"interrupted: {kept} are kept: run {again} to resume") from None
         finally:
             close_worlds()
 
@@ -94,14 +91,6 @@ def run(plan: Plan, on_event: OnEvent = lambda event: None, *, write: Save = lam
         save(plan, record.id)
         with workers(plan, record.id) as tend:
             return follow(plan, record, tend, EpisodeRunner(plan.study.rollouts, write), forward)
-
-
-def _kept(plan: Plan) -> str:
-    try:
-        done, total = counts_of(plan.study)
-        return f"{done} of {count(total or len(plan.study.episodes), 'episode')}"  # its plan may not be written yet
-    except StorageError:
-        return "all complete episodes"
 
 
 def work_command(database: Database, study: str, **settings: str) -> str:
