@@ -1,6 +1,5 @@
 """No command replaces what another command has made, unless `replace=true` is typed."""
 
-import multiprocessing
 import os
 import shutil
 import signal
@@ -9,7 +8,8 @@ from random import Random
 
 import pytest
 import torch
-from command import kerv, process, refusal, told
+from command import kerv, refusal, told
+from conftest import python, until
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import owned, temporary_beside, unfinished
@@ -122,36 +122,27 @@ def test_names_are_limited_in_bytes(tmp_path):
 # --- the lock
 
 
-def hold(folder: Path, ready: "multiprocessing.synchronize.Event", end: "multiprocessing.synchronize.Event") -> None:
-    with owned(folder, lambda: None):
-        ready.set()
-        end.wait(60)
+HOLD = """
+import sys, time
+from pathlib import Path
+from kerv_cli.base.files import owned
+with owned(Path(sys.argv[1]), lambda: None):
+    Path(sys.argv[2]).touch()
+    time.sleep(60)
+"""
 
 
-def test_two_trainings_of_one_name_do_not_write_at_the_same_time(results, monkeypatch):
-    """In another container with the same host name, the process id says nothing: the operating system's lock does."""
-    folder, context = results / "artifacts/target/shared", multiprocessing.get_context("spawn")
-    ready, end = context.Event(), context.Event()
-    holder = context.Process(target=hold, args=(folder, ready, end))
-    holder.start()
-    assert ready.wait(60)
-    line = refusal("train", "target", "name=shared", *TRAINING, f"results={results}", code=2)
-    assert f"another command is making {folder}" in line
-    assert not folder.exists()
-    holder.kill()  # the lock ends with its process
-    holder.join()
+def test_two_trainings_of_one_name_do_not_write_at_the_same_time(results, tmp_path):
+    folder = results / "artifacts/target/shared"
+    with python(HOLD, folder, tmp_path / "held") as holder:
+        until((tmp_path / "held").exists)
+        line = refusal("train", "target", "name=shared", *TRAINING, f"results={results}", code=2)
+        assert f"another command is making {folder}" in line
+        assert not folder.exists()
+        holder.kill()  # the lock ends with its process
+        holder.join()
     with owned(folder, lambda: None):
         pass
-
-
-def test_a_lock_needs_no_process_id(tmp_path):
-    text = (
-        f"from pathlib import Path; from kerv_cli.base.files import owned; import contextlib\n"
-        f"with owned(Path({str(tmp_path / 'x')!r}), lambda: None): print('held')"
-    )
-    with owned(tmp_path / "x", lambda: None):
-        assert "another command is making" in process("-c", text).stderr
-    assert process("-c", text).stdout == "held\n"
 
 
 # --- a command that replaces is killed
@@ -184,8 +175,9 @@ def test_a_killed_training_that_replaces_leaves_the_old_weights_and_goes_on(resu
     folder, random = results / "artifacts/target/nano-state", Random(70)
     words += ["name=nano-state", "replace=true"]
     for moment in (random.randrange(12, 24), random.randrange(3, 14)):  # a validation syncs the disk 12 times
-        run = process("-c", KILLED, str(moment), *words, OMP_NUM_THREADS="1")
-        assert run.returncode == -signal.SIGKILL, run.stderr
+        with python(KILLED, moment, *words) as run:
+            run.join(120)
+            assert run.exitcode == -signal.SIGKILL
         load_target(folder)
         assert read_target(folder).sha256 == old
         assert unfinished(folder).is_dir()

@@ -1,6 +1,5 @@
 """The registry: names, collisions, plugins, and that everything it names is there."""
 
-import os
 from importlib.metadata import EntryPoint
 
 import pytest
@@ -135,25 +134,25 @@ def test_a_plugins_proposer_is_a_choice_like_any_other(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("plugins", "says"),
     [
-        ("not_there", "kerv: plugin not_there: ModuleNotFoundError: No module named 'not_there'"),
+        ("not_there", "plugin not_there: ModuleNotFoundError: No module named 'not_there'"),
         ("collides", "collides.py:13: proposer 'drafter' is registered twice: kerv_cli.methods.eagle"),
         ("unfinished", "unfinished.py:2: SyntaxError: "),
         ("unknown", "unknown.py:1: NameError: name 'nothing' is not defined"),
         ("misspelt", "misspelt.py:2: TypeError: SkipPart.__init__() got an unexpected keyword argument 'take_draft'"),
     ],
 )
-def test_a_plugin_that_does_not_work_gets_one_line(tmp_path, plugins, says):
+@pytest.mark.usefixtures("shelf")
+def test_a_plugin_that_does_not_work_gets_one_line(tmp_path, plugins, says, monkeypatch):
     (tmp_path / "collides.py").write_text(PLUGIN.format(name="drafter"))
     (tmp_path / "unfinished.py").write_text("x = 1\ndef f(:\n")
     (tmp_path / "unknown.py").write_text("nothing\n")
     (tmp_path / "misspelt.py").write_text(
         "from kerv_cli.base.registry import SkipPart\nSkipPart('mine', take_draft=True).add()\n"
     )
-    path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
-    done = process("-m", "kerv_cli", "rollout", "--cfg", PYTHONPATH=path, KERV_PLUGINS=plugins)
-    assert done.returncode == 2
-    assert says in done.stderr
-    assert done.stderr.count("\n") == 1
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv(registry.PLUGINS, plugins)
+    with refused(says, error=UsageError):
+        registry.load_plugins.__wrapped__()
 
 
 def test_an_installed_package_registers_by_an_entry_point(tmp_path, monkeypatch, shelf):
