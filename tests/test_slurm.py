@@ -10,11 +10,10 @@ from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
-from conftest import python, refused, until
+from conftest import python, until
 from studies_synthetic import swept, threshold_study, unhurried
 
 from kerv_cli.base.config import compose
-from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import EPISODES, UNFINISHED, WANTED, opened
 from kerv_cli.lab.store import Study, counts_of
@@ -126,10 +125,3 @@ def test_a_study_survives_its_sweep_a_cancelled_worker_and_a_preempted_one(tmp_p
     with store.database.reading() as connection:
         assert connection.scalar(sa.select(sa.func.count()).select_from(EPISODES)) == 36
         assert connection.scalar(sa.select(sa.func.count()).select_from(WANTED).where(UNFINISHED)) == 0
-
-
-@pytest.mark.usefixtures("slurm")
-def test_what_slurm_refuses_is_one_line(tmp_path):
-    launch = SETTINGS.launch.replace("sbatch", "sbatch --mem=100000G")
-    with refused("runtime.launch: sbatch", "Memory specification"):
-        swept(tmp_path, STUDY, runtime=RuntimeSettings(launch=launch))

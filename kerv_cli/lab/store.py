@@ -124,9 +124,7 @@ def sweep_command(study: Study, *overrides: str) -> str:
         overrides: Further overrides to append. They replace stored overrides of the same keys.
     """
     typed = swept_by(study) or ("sweep", f"study={study.name}")
-    replaced = {"results", "rerun"}
-    for word in overrides:
-        replaced.add(word.partition("=")[0])
+    replaced = {"results", "rerun", *(word.partition("=")[0] for word in overrides)}
     kept = [word for word in typed if word.partition("=")[0] not in replaced and not word.startswith("-")]
     return shlex.join(["kerv", *kept, *overrides, *study.database.words])
 

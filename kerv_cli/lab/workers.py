@@ -6,15 +6,13 @@ Workers on this machine end when the sweep ends, even if the sweep is killed. Ot
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import shlex
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -25,7 +23,7 @@ from kerv_cli.base.durations import count
 from kerv_cli.base.errors import Interrupted, KervError, StorageError, UsageError
 from kerv_cli.episodes.runner import close_worlds
 from kerv_cli.lab.command import STORE
-from kerv_cli.lab.database import EPISODES, Database
+from kerv_cli.lab.database import EPISODES
 from kerv_cli.lab.queue import MOST_DEATHS, patiently
 from kerv_cli.lab.runs import Run, bury
 from kerv_cli.lab.store import ROLLOUT
@@ -93,14 +91,6 @@ def run(plan: Plan, on_event: OnEvent = lambda event: None, *, write: Save = lam
             return follow(plan, record, tend, EpisodeRunner(plan.study.rollouts, write), forward)
 
 
-def work_command(database: Database, study: str, **settings: str) -> str:
-    """Return the shell command that starts a worker for a study. It names no password."""
-    words = as_overrides(study=study, results=str(database.results.absolute()), **settings)
-    if database.store and not sa.make_url(database.store).password:
-        words.append(f"store={database.shown}")
-    return shlex.join(["kerv", "work", *words])
-
-
 def gpus_in_turn(plan: Plan) -> list[str]:
     """Return one value of CUDA_VISIBLE_DEVICES per GPU. Workers get these values in turn.
 
@@ -133,7 +123,10 @@ def workers(plan: Plan, run: str, say: Callable[[str], object] = lambda line: No
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
     environment = os.environ | {STORE: study.database.store, "PATH": path}
     if plan.blocks and plan.is_elsewhere:
-        line = work_command(study.database, study.name)
+        words = as_overrides(study=study.name, results=str(study.database.results.absolute()))
+        if study.database.store and not sa.make_url(study.database.store).password:
+            words.append(f"store={study.database.shown}")
+        line = shlex.join(["kerv", "work", *words])
         if runtime.launch:
             _launch(runtime.launch.replace("{command}", line).replace("{workers}", str(runtime.workers)), environment)
         else:
@@ -141,11 +134,8 @@ def workers(plan: Plan, run: str, say: Callable[[str], object] = lambda line: No
     if not plan.blocks or plan.is_elsewhere or runtime.workers == 1:
         yield lambda left: patiently(bury, study.database)
         return
-    threads = max((one.setting.settings["runtime"]["threads"] for one in plan.to_run), default=1)
-    environment |= dict.fromkeys(THREAD_VARIABLES, str(threads))
-    number = min(runtime.workers, len(plan.blocks))
-    with LocalWorkers(study.database, study.name, run, number, environment, gpus_in_turn(plan)) as local:
-        yield local.tend
+    with _local_workers(plan, run, environment) as tend:
+        yield tend
 
 
 def _launch(line: str, environment: dict[str, str]) -> None:
@@ -155,85 +145,60 @@ def _launch(line: str, environment: dict[str, str]) -> None:
         raise KervError(f"runtime.launch: {line} failed: {said}")
 
 
-@dataclass
-class _Worker:
-    process: subprocess.Popen[bytes]
-    log: IO[bytes]
-    gpu: str
+@contextlib.contextmanager
+def _local_workers(plan: Plan, run: str, environment: Mapping[str, str]) -> Iterator[Tend]:
+    """Keep processes of `kerv work` at work during a `with` block.
 
-    def close(self) -> None:
-        self.process.kill()
-        self.process.communicate()
-        self.log.close()
-
-
-class LocalWorkers:
-    """Processes of `kerv work`. Use it in a `with` statement, which starts and ends them.
-
-    Each worker reads from a pipe that nobody writes to. When this process ends, even if it is killed, the pipe is
-    closed, and the workers end.
-
-    Args:
-        database: The database.
-        study: Name of the study.
-        run: Id of the command.
-        number: Number of workers.
-        environment: Environment variables.
-        gpus: Values of CUDA_VISIBLE_DEVICES, which the workers get in turn. If empty, the variable stays as it is.
+    Each reads from a pipe that nobody writes to. When this process ends, even if it is killed, the pipe is closed, and
+    the workers end.
     """
+    database, gpus = plan.study.database, gpus_in_turn(plan)
+    words = as_overrides(study=plan.study.name, results=str(database.results.absolute()), run=run)
+    threads = max(one.setting.settings["runtime"]["threads"] for one in plan.to_run)
+    last = killed = 0
 
-    def __init__(
-        self,
-        database: Database,
-        study: str,
-        run: str,
-        number: int,
-        environment: dict[str, str],
-        gpus: Sequence[str] = (),
-    ) -> None:
-        self.database, self._environment = database, environment
-        words = as_overrides(study=study, results=str(database.results.absolute()), run=run)
-        self._words = [sys.executable, "-m", "kerv_cli", "work", *words]
-        self._gpus = list(itertools.islice(itertools.cycle(gpus or [""]), number))
-        self._workers: list[_Worker] = []
-        self._left = self._killed = 0
-
-    def __enter__(self) -> LocalWorkers:
-        self._workers = list(map(self._started, self._gpus))
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for worker in self._workers:
-            worker.process.kill()
-        for worker in self._workers:
-            worker.close()
-        with contextlib.suppress(KervError):
-            bury(self.database)
-
-    def _started(self, gpu: str) -> _Worker:
-        environment = self._environment | ({GPUS: gpu} if gpu else {})
-        log = tempfile.TemporaryFile()  # noqa: SIM115 - `close` closes it
+    def started(number: int) -> tuple[subprocess.Popen[bytes], IO[bytes]]:
+        own = {**environment, **dict.fromkeys(THREAD_VARIABLES, str(threads))}
+        own |= {GPUS: gpus[number % len(gpus)]} if gpus else {}
+        log = tempfile.TemporaryFile()  # noqa: SIM115 - `_end` closes it
         streams: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": log}
-        return _Worker(subprocess.Popen(self._words, env=environment, **streams), log, gpu)
+        return subprocess.Popen([sys.executable, "-m", "kerv_cli", "work", *words], env=own, **streams), log
 
-    def tend(self, left: int) -> None:
-        """Free what killed workers had claimed, and replace them. `left`: number of episodes that have not ended."""
-        patiently(bury, self.database)
-        for at, worker in enumerate(self._workers):
-            code = worker.process.poll()
+    def tend(left: int) -> None:
+        nonlocal last, killed
+        patiently(bury, database)
+        for number, (process, log) in enumerate(running):
+            code = process.poll()
             if code is None or code == 0:
                 continue
             if code not in (130, 137) and code > 0:
-                worker.log.seek(0)
-                line = worker.log.read().decode(errors="replace").strip().rpartition("\n")[2].strip()
+                log.seek(0)
+                line = log.read().decode(errors="replace").strip().rpartition("\n")[2].strip()
                 raise KervError(f"a worker process ended: {line.removeprefix('kerv: ') or f'exit code {code}'}")
-            self._left, self._killed = left, self._killed + 1 if left == self._left else 1
+            last, killed = left, killed + 1 if left == last else 1
             # an episode in which MOST_DEATHS workers die fails, and is not left any more
-            if self._killed > MOST_DEATHS * len(self._workers):
-                raise KervError(f"{self._killed} worker processes were killed and no episode has ended: "
+            if killed > MOST_DEATHS * len(running):
+                raise KervError(f"{killed} worker processes were killed and no episode has ended: "
                                 "is there enough memory for them? try runtime.workers=1")  # fmt: skip
-            worker.close()
-            self._workers[at] = self._started(worker.gpu)
+            _end(process, log)
+            running[number] = started(number)
+
+    running = list(map(started, range(min(plan.runtime.workers, len(plan.blocks)))))
+    try:
+        yield tend
+    finally:
+        for process, _ in running:
+            process.kill()
+        for one in running:
+            _end(*one)
+        with contextlib.suppress(KervError):
+            bury(database)
+
+
+def _end(process: subprocess.Popen[bytes], log: IO[bytes]) -> None:
+    process.kill()
+    process.communicate()
+    log.close()
 
 
 class TimeLeft:
