@@ -37,7 +37,6 @@ class Plan:
         existing: Row numbers of the episodes that the database has.
         missing: Episodes to run, each with the reason in a few words, such as `new seeds`.
         anew: Whether to run all episodes again.
-        seen: Row numbers of the episodes that the study had when it was planned.
         runtime: Workers and device.
         command: Command-line arguments (without `kerv`) that resume the study.
     """
@@ -46,7 +45,6 @@ class Plan:
     existing: Mapping[Episode, int]
     missing: Mapping[Episode, str]
     anew: bool = False
-    seen: frozenset[int] = frozenset()
     runtime: RuntimeSettings = field(default_factory=RuntimeSettings)
     command: tuple[str, ...] = ()
 
@@ -159,8 +157,7 @@ def plan_study(
         stored = stored_episodes(connection, study)
         earlier = _earlier(connection, study.labels)
     existing, missing = split(study.episodes, study.block, stored, known, rerun, earlier)
-    seen = frozenset(row.episode_id for row in known.values() if row.episode_id is not None)
-    return Plan(study, existing, missing, rerun == ALL, seen, runtime or RuntimeSettings(), tuple(command))
+    return Plan(study, existing, missing, rerun == ALL, runtime or RuntimeSettings(), tuple(command))
 
 
 def _earlier(connection: sa.Connection, labels: Sequence[str]) -> dict[str, Setting]:
@@ -201,7 +198,9 @@ def save(plan: Plan, run: str = "") -> None:
         to_run = dict[Episode, dict[str, Any]]()
         for position, (key, one) in enumerate(wanted.items(), first):
             row, linked = before.get(key), plan.existing.get(one)
-            if row is not None and _stays(row, linked, plan, is_shared):
+            # an episode that ended after planning counts, too
+            counts = linked is not None or not (plan.anew or one.setting.depends_on_order)
+            if row is not None and (counts if row["episode_id"] is not None else is_shared and _is_unfinished(row)):
                 after[key] = row | {"position": position}
                 continue
             after[key] = dict(zip(_KEY, key, strict=True)) | {
@@ -245,13 +244,6 @@ def _replace(connection: sa.Connection, before: Mapping[Any, Any], after: Mappin
 
 def _is_unfinished(row: Mapping[str, Any]) -> bool:
     return row["block"] is not None and row["episode_id"] is None and row["error"] is None
-
-
-def _stays(row: Mapping[str, Any], linked: int | None, plan: Plan, is_shared: bool) -> bool:
-    """Return whether a row of the study stays as it is: it has an episode that counts, or a worker may run it."""
-    if row["episode_id"] is not None:
-        return linked is not None or row["episode_id"] not in plan.seen
-    return is_shared and _is_unfinished(row)
 
 
 def _still_asked_for(rows: Mapping[Any, dict[str, Any]], wanted: Iterable[tuple[int, str, int]]) -> dict[Any, Any]:
