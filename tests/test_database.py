@@ -7,8 +7,6 @@ import os
 import resource
 import signal
 import sqlite3
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -381,8 +379,7 @@ def test_one_query_says_whether_anything_has_changed(database):
 
 HOLD = """
 import sys
-import tempfile
-from collections.abc import Callable
+import time
 from pathlib import Path
 from kerv_cli.lab.command import noted
 from kerv_cli.lab.database import opened
@@ -391,8 +388,8 @@ results = Path(sys.argv[1])
 words = ["demos", "name=mine", "episodes=7", f"results={results}"]
 with noted(words), making(opened(results), "demos", results / "artifacts/demos/mine") as record:
     record.beat(3, 7)
-    print("begun", flush=True)
-    sys.stdin.read()
+    (results / "begun").touch()
+    time.sleep(60)
 """
 
 
@@ -403,15 +400,14 @@ def listed(results: Path) -> list[dict[str, Any]]:
 def test_a_name_in_use_is_refused_and_a_killed_command_is_listed_with_how_to_go_on(tmp_path):
     again = "kerv demos name=mine episodes=7 results="
     place = tmp_path / "artifacts/demos/mine"
-    with subprocess.Popen(
-        [sys.executable, "-c", HOLD, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout.readline() == "begun\n"
+    with python(HOLD, tmp_path) as process:
+        until((tmp_path / "begun").exists)
         line = told("demos", "name=mine", "task=reach", f"results={tmp_path}", code=2)
         assert "demos mine is being made on " in line
         assert listed(tmp_path)[0]["state"] == "running, 3 of 7"
         assert "is running" in told("runs", "rm", "demos/mine", "--yes", f"results={tmp_path}", code=2)
         process.kill()
+        process.join()
     words = ["demos", "name=mine", "episodes=8"]
     with pytest.raises(UsageError), noted(words), making(opened(tmp_path), "demos", place):
         raise UsageError("these are others")

@@ -8,7 +8,7 @@ import time
 
 import pytest
 from command import told
-from conftest import refused, write_policy
+from conftest import python, refused, write_policy
 
 from kerv_cli.base.errors import UsageError
 from kerv_cli.episodes.runner import Runner
@@ -92,9 +92,9 @@ with Presence(Database(sys.argv[1]), "a run"):
 
 
 def test_a_killed_process_of_this_machine_is_known_at_once(tmp_path):
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    killed = subprocess.run([sys.executable, "-c", DIES, str(tmp_path)], env=environment, check=False)
-    assert killed.returncode == -9
+    with python(DIES, tmp_path) as killed:
+        killed.join(60)
+        assert killed.exitcode == -9
     database = opened(tmp_path)
     with Presence(database, "another") as presence, database.reading() as connection:
         assert living(database, connection) == {presence.worker: "another"}
