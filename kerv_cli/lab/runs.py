@@ -122,18 +122,13 @@ class Presence:
     def __init__(self, database: Database, run: str = "") -> None:
         self.database, self.run = database, run
         self.worker = f"{socket.gethostname()[:60]}-{secrets.token_hex(6)}"
-        self._lock: int | None = None
         self._ended = threading.Event()
         self._heart = threading.Thread(target=self._keep_beating, daemon=True)
 
     def __enter__(self) -> Self:
+        with self.database.writing() as connection:
+            self._begin_in(connection)
         self._lock = _lock(_lock_of(self.database, self.worker))
-        try:
-            with self.database.writing() as connection:
-                self._begin_in(connection)
-        except BaseException:
-            self._unlock()
-            raise
         self._heart.start()
         return self
 
@@ -141,11 +136,6 @@ class Presence:
         forgotten = WORKERS.c.heartbeat < clock(connection) - _FORGET_SECONDS
         connection.execute(sa.delete(WORKERS).where(forgotten))
         self.beat_in(connection)
-
-    def _unlock(self) -> None:
-        if self._lock is not None:
-            os.close(self._lock)
-            _lock_of(self.database, self.worker).unlink(missing_ok=True)
 
     def beat_in(self, connection: sa.Connection) -> None:
         """Write a sign of life, in a transaction."""
@@ -172,7 +162,8 @@ class Presence:
         with contextlib.suppress(StorageError), self.database.writing() as connection:
             connection.execute(sa.update(WANTED).where(mine, UNFINISHED).values(worker=None, attempts=0))
             connection.execute(sa.delete(WORKERS).where(WORKERS.c.name == self.worker))
-        self._unlock()
+        os.close(self._lock)
+        _lock_of(self.database, self.worker).unlink(missing_ok=True)
 
 
 _SEEN = sa.select(sa.func.max(WORKERS.c.heartbeat)).where(WORKERS.c.run == RUNS.c.id).scalar_subquery()
