@@ -285,7 +285,7 @@ ANSWERS = [
     ("train targt", "unknown train command 'targt': did you mean target?"),
     ("rollout --task=reach", "settings have no dashes: task=reach"),
     ("rollout --method kerv", "settings have no dashes: method=VALUE"),
-    ("runs export --to", "Option '--to' requires an argument"),
+    ("runs export --dir", "Option '--dir' requires an argument"),
     # lists, empty values
     ("rollout reach", "'reach' is not an override: write key=value"),
     ("rollout task=reach, push", "write a list without spaces, task=[reach,push]"),
