@@ -137,7 +137,7 @@ def link_files(folder: Path, new: Path) -> None:
 
 
 def visible(folder: Path) -> list[Path]:
-    """Return the paths in a folder in alphabetical order, without hidden ones. Empty if the folder does not exist."""
+    """Return the paths in a folder in alphabetical order, without hidden ones. Empty if there is no folder."""
     try:
         return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     except OSError:
@@ -243,7 +243,6 @@ def temporary_beside(path: Path) -> Path:
 
 
 def clean(folder: Path) -> None:
-    """Remove the temporary paths that killed processes left in a folder."""
     for path in folder.glob(".*.tmp"):
         with contextlib.suppress(OSError):  # it was renamed or removed meanwhile
             if time.time() - path.lstat().st_ctime > LEFT_OVER_SECONDS:

@@ -58,7 +58,6 @@ def check_name(name: str, what: str) -> str:
 
 
 def shipped_dir() -> Path:
-    """Return the folder of the shipped policies, in a checkout or in the installed package."""
     package = Path(__file__).resolve().parents[1]
     checkout = package.parent / "results" / "pretrained"
     return checkout if checkout.is_dir() else package / "pretrained"
