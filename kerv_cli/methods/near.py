@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from kerv_cli.base.limits import MOST_TOKENS, number
 from kerv_cli.base.registry import PREFILL, ProposerPart
 from kerv_cli.engine.proposer import Proposer
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from kerv_cli.engine.chunk import Chunk
     from kerv_cli.engine.draft import Draft
 
@@ -44,6 +44,8 @@ class NearProposer(Proposer):
         self.nodes = self.settings.nodes
 
     def propose(self, chunk: Chunk, depth: int) -> Draft:
+        import numpy as np
+
         from kerv_cli.engine.draft import EMPTY, Draft
 
         space, dofs, committed = chunk.space, chunk.space.dofs, len(chunk.tokens)
@@ -71,6 +73,8 @@ def expected(past: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray, np.n
     Returns the guesses (2, steps, D) *hold* and *line*, the sizes of their errors so far (2, steps, D), in bins, and
     how much each guess is trusted (2,), which sums to 1.
     """
+    import numpy as np
+
     speed = np.diff(past, axis=0, prepend=past[:1])
     last = len(past) - 1
     guesses = np.empty((2, steps, past.shape[1]))
@@ -98,6 +102,8 @@ def probabilities(guesses: np.ndarray, scales: np.ndarray, vocabulary: int) -> n
 
     A two-sided geometric distribution around the guess (2, N), whose mean error grows with the scale (2, N), in bins.
     """
+    import numpy as np
+
     ratio = scales / (1 + scales)
     away = np.abs(np.arange(vocabulary) - np.clip(guesses, 0, vocabulary - 1)[..., None])
     found: np.ndarray = ((1 - ratio) / (1 + ratio))[..., None] * ratio[..., None] ** away + 1e-9
@@ -111,6 +117,8 @@ def likely_tree(table: np.ndarray, weights: np.ndarray, nodes: int) -> tuple[lis
         table: Probability of each token under each guess, (2, places, V).
         weights: How much each guess is trusted, (2,). Along a path the guess that gives its tokens gains.
     """
+    import numpy as np
+
     tokens, parents = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
     chances, paths, first = [np.zeros(0)], weights[None], -1  # paths (n, 2): probability of n prefixes and each guess
     width = min(WIDTH, table.shape[2])
