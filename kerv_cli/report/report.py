@@ -39,7 +39,7 @@ from kerv_cli.report.summary import (
     task_table,
     with_code,
 )
-from kerv_cli.report.tables import RUNTIME, StudyData, differences, flatten, load_study
+from kerv_cli.report.tables import RUNTIME, StudyData, flatten, load_study
 from kerv_cli.report.verdict import Verdict, caution, order_of, question, verdict_of
 from kerv_cli.report.viewing.viewer import animation, film_of
 
@@ -248,9 +248,10 @@ def _settings(data: StudyData) -> list[dict[str, Any]]:
     flat = {label: flatten(without(one.settings, NOT_DETERMINING)) for label, one in data.settings.items()}
     settings = []
     for label, own in flat.items():
-        reference = data.references[label]
-        about = {"label": label, "overrides": " ".join(data.settings[label].overrides), "reference": reference}
-        settings.append({**about, "differs": differences(flat.get(reference, {}), own)})
+        reference, words = data.references[label], " ".join(data.settings[label].overrides)
+        others = flat.get(reference, {})
+        differs = [(key, others.get(key), own.get(key)) for key in others | own if others.get(key) != own.get(key)]
+        settings.append({"label": label, "overrides": words, "reference": reference, "differs": differs})
     return settings
 
 

@@ -80,6 +80,8 @@ class StudyData:
     @functools.cached_property
     def absent(self) -> list[Episode]:
         """Episodes that the study asks for and that are not stored yet."""
+        if len(self.episodes) == len(self.study.episodes):
+            return []
         present = set(self.episodes[["label", "task", "seed"]].itertuples(index=False, name=None))
         return [one for one in self.study.episodes if (one.setting.label, *one.key[1:]) not in present]
 
@@ -205,7 +207,6 @@ def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyDa
     whole = whole_runs(study) if wanted is None else []
     same_pairs = len(whole) > 2
     frames = [frame_of(study, run=run) for run in whole] if same_pairs else _with_new_seeds(frame)
-    # imported episodes may lack some columns
     states = {name: set(frame[name].unique()) for name in frame.columns.intersection(list(_ONE_STATE))}
     runs = [_labelled(study, run) for run in frames if all(set(run[name].unique()) == states[name] for name in states)]
     return StudyData(study, _labelled(study, frame), tuple(runs) if len(runs) > 2 else (), same_pairs)
@@ -318,16 +319,6 @@ def flatten(settings: Plain) -> Row:
         if isinstance(value, list | tuple):
             values[key] = _joined(value)
     return values
-
-
-def differences(first: Row, second: Row) -> list[Row]:
-    """Return the keys whose values differ, as `key`, `first` and `second`. A missing value is None."""
-    found = []
-    for key in first | second:
-        pair = {"key": key, "first": first.get(key), "second": second.get(key)}
-        if pair["first"] != pair["second"]:
-            found.append(pair)
-    return found
 
 
 def _joined(values: Iterable[object]) -> str:
