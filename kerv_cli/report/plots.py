@@ -144,8 +144,8 @@ def _tooltip(points: Sequence[Point]) -> list[alt.Tooltip]:
     return [alt.Tooltip(f"{name}:N", title=name.removeprefix("text ")) for name in texts]
 
 
-def _faded(full: float) -> alt.When:
-    return alt.when("picked == '' || picked == datum.setting").then(alt.value(full)).otherwise(alt.value(0.12))
+def _faded(full: float) -> alt.OpacityValue:
+    return alt.OpacityValue(0.12, condition={"test": "picked == '' || picked == datum.setting", "value": full})
 
 
 def _tradeoff(results: Sequence[Result], loss: float, colours: Mapping[str, str]) -> alt.ConcatChart:
@@ -177,8 +177,8 @@ def _tradeoff(results: Sequence[Result], loss: float, colours: Mapping[str, str]
         scale = alt.Scale(type=kind, nice=False, padding=10, **({} if kind == "log" else {"zero": False}))
         at = alt.X("low:Q", scale=scale, title=None)
         line = alt.Chart().mark_rule(strokeDash=[4, 3], color=INK).encode(x=alt.datum(bound, type="quantitative"))
-        bars = base.mark_rule(strokeWidth=3).encode(x=at, x2="high:Q", opacity=_faded(0.4))
-        dots = base.mark_point(filled=True, size=75, cursor="pointer").encode(x="value:Q", opacity=_faded(1.0))
+        bars = base.mark_rule(strokeWidth=3).encode(x=at, x2=alt.X2("high:Q"), opacity=_faded(0.4))
+        dots = base.mark_point(filled=True, size=75, cursor="pointer").encode(x=alt.X("value:Q"), opacity=_faded(1.0))
         title = alt.Title(TITLES[column], subtitle=hint)
         charts.append((line + bars + dots).properties(title=title, width=_WIDTH, height=alt.Step(24)))
     return _chart(charts, 2, datasets)
@@ -202,7 +202,7 @@ def lines_figure(panels: Sequence[Panel], colours: Mapping[str, str], ylabel: st
         own = alt.Color("setting:N", scale=scale, legend=legend)
         layers = [
             alone.mark_rule(strokeDash=[5, 4], strokeWidth=1.5).encode(y=y, opacity=_faded(0.9)),
-            drawn.mark_rule(strokeWidth=2).encode(y=low, y2="high:Q", color=own, opacity=_faded(0.35)),
+            drawn.mark_rule(strokeWidth=2).encode(y=low, y2=alt.Y2("high:Q"), color=own, opacity=_faded(0.35)),
             drawn.mark_line(strokeWidth=1.5).encode(y=y),
             drawn.mark_point(filled=True, size=60, cursor="pointer").encode(y=y, color=own, opacity=_faded(1.0)),
         ]
