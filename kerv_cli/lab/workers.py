@@ -26,7 +26,7 @@ from kerv_cli.lab.command import STORE
 from kerv_cli.lab.database import EPISODES
 from kerv_cli.lab.queue import MOST_DEATHS, patiently
 from kerv_cli.lab.runs import Run, bury
-from kerv_cli.lab.store import ROLLOUT
+from kerv_cli.lab.store import ROLLOUT, counts_of
 from kerv_cli.lab.study import Plan, save, withdraw
 from kerv_cli.lab.work import (
     Counted,
@@ -59,12 +59,14 @@ def begun(plan: Plan) -> Iterator[Run]:
         try:
             yield run
         except BaseException as error:
+            done, total = len(plan.existing) + run.done, 0
             if not isinstance(error, UsageError):  # that is, the plan was not saved
                 with contextlib.suppress(StorageError):
                     withdraw(plan, run.id)
+                    done, total = counts_of(study)
             if not isinstance(error, KeyboardInterrupt):
                 raise
-            kept = f"{len(plan.existing) + run.done} of {count(len(study.episodes), 'episode')} of {study.name}"
+            kept = f"{done} of {count(total or len(study.episodes), 'episode')} of {study.name}"
             again = "the same command" + (" without rerun=all" if plan.anew and study.kind != ROLLOUT else "")
             raise Interrupted(f"interrupted: {kept} are kept: run {again} to resume") from None
         finally:
