@@ -30,6 +30,8 @@ def check_writable(results: str) -> Path:
     """Check that the results folder can be written. Return it, or the nearest existing folder above it."""
     folder = results_dir(results)
     parent = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not parent.is_dir():
+        raise UsageError(f"results={results}: {parent} is a file, name a folder")
     try:
         # an unnamed file, if the file system supports that: nothing is left if the process is killed here
         with storage_errors(folder), tempfile.TemporaryFile(dir=parent):
