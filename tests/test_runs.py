@@ -106,6 +106,8 @@ def test_runs_are_listed_and_filtered(results):
     assert listed(results, "kind=target")[0]["id"] == "target/nano-state"
     assert listed(results, "task=push") == []
     assert "did you mean method" in kerv("runs", "list", "methd=ar", f"results={results}", code=2).stderr
+    assert "did you mean sweep" in kerv("runs", "list", "kind=swep", code=2).stderr
+    assert "step, running, interrupted, failed, 2 of 6 episodes" in kerv("runs", "list", "state=x", code=2).stderr
 
 
 def test_a_run_is_shown_and_a_wrong_name_refused(results):

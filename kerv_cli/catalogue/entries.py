@@ -31,6 +31,7 @@ LOG, WEIGHTS = "log.csv", "model.safetensors"  # files of a training
 # Argument of commands that stands for the newest entry
 LAST = "last"
 _STUDIES = (SWEEP, ROLLOUT)
+_STATES = ("complete", "begun", "damaged", "step ", "running", "interrupted", "failed")
 _FILTERS = ("kind", "method", "task", "state")
 
 
@@ -151,7 +152,12 @@ def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry
     for key in filters:
         if key not in _FILTERS:
             raise UnknownName("filter", key, _FILTERS)
+    kinds = (*_STUDIES, *artifact_kinds())
+    if filters.get("kind", SWEEP) not in kinds:
+        raise UnknownName("kind of run", filters["kind"], kinds)
     state, task = filters.get("state", ""), filters.get("task", "*")
+    if not any(one.startswith(state) or state.startswith(one) for one in _STATES) and not state[:1].isdigit():
+        raise UnknownName("state", state, [*map(str.strip, _STATES), "2 of 6 episodes"])
 
     def agrees(run: RunEntry) -> bool:
         return (
