@@ -55,7 +55,7 @@ class FastCode:
 
     @classmethod
     def learn(cls, chunks: np.ndarray) -> FastCode:
-        """Return a code for chunks of this shape, with merges learnt from n chunks (n, H, D) of normalised actions."""
+        """Learn merges from n chunks (n, H, D) of normalised actions. The code fits chunks of the same H and D."""
         from tokenizers import Tokenizer, models, trainers
 
         plain, merges = cls(chunks.shape[1], chunks.shape[2], SCALE), []
@@ -120,7 +120,7 @@ class FastCode:
         return idct(coefficients.reshape(-1, self.steps, self.dofs) / self.scale, axis=1, norm="ortho")
 
     def values(self, coefficients: Sequence[int]) -> np.ndarray:
-        """Return the normalised actions (H, D) of at most H · D rounded coefficients. Missing coefficients are 0."""
+        """Return the normalised actions (H, D), in [-1, 1], of up to H · D rounded coefficients. Missing ones are 0."""
         full = np.zeros(self.steps * self.dofs)
         full[: len(coefficients)] = coefficients
         return np.clip(self.motions(full)[0], -1.0, 1.0)

@@ -58,9 +58,10 @@ def _parts_of(group: str) -> dict[str, Part]:
 
 
 def compose(command: str, overrides: Sequence[str], schema: type[T]) -> T:
-    """Return the settings of a command (its name with `_` instead of a space).
+    """Return the checked settings of a command. `command` is its name with `_` for spaces, such as `train_target`.
 
-    `quick=true` adds the command's settings in `conf/quick.yaml`. Typed settings take precedence over these.
+    `quick=true` adds the settings that `conf/quick.yaml` has for this command. Settings that the user typed take
+    precedence.
     """
     from omegaconf import OmegaConf
     from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
@@ -131,7 +132,7 @@ def _typed(overrides: Sequence[str], schema: type) -> dict[str, Any]:
 
 
 def preset_file(group: str, name: str) -> Path:
-    """Return the path of a method or study file: a name in `conf/<group>`, or any path that ends in .yaml or .yml."""
+    """Return the path of a preset. `name` is a file's name in `conf/<group>`, or a path that ends in .yaml or .yml."""
     if name.endswith((".yaml", ".yml")):
         return Path(name).expanduser()
     path = conf_dir() / group / f"{name}.yaml"
@@ -141,9 +142,10 @@ def preset_file(group: str, name: str) -> Path:
 
 
 def _read_preset(group: str, name: str) -> tuple[dict[str, str], list[tuple[str, Any]], dict[str, str]]:
-    """Read a method or study file. In a method file, `proposer: drafter` chooses a part, all other keys set values.
+    """Read a method or study file. In a method file, a line such as `proposer: drafter` chooses a part.
 
-    Return the chosen part by group, the (key, value) pairs, and the place `FILE:LINE: ` of each key for errors.
+    Return the chosen parts by group, all other keys as (key, value) pairs, and for each key the prefix `FILE:LINE: ` of
+    error messages.
     """
     if not group:
         return {}, [], {}
@@ -190,7 +192,7 @@ def _parsed(override: str) -> Any:
 
 @functools.lru_cache(maxsize=256)
 def _composed(choices: tuple[tuple[str, str], ...], schema: type, conf: Path, artifacts: tuple[str, ...]) -> bytes:
-    """Return the settings with these choices, pickled: unpickling takes a fifth of the time of a deep copy."""
+    """Return the settings with these choices, pickled. Unpickling them is five times as fast as a deep copy."""
     from omegaconf import OmegaConf
 
     known, nodes = groups(), OmegaConf.structured(schema)
@@ -271,9 +273,9 @@ def split(text: str) -> list[str]:
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:
-    """Combine all values of the overrides: `threshold.r=0,3` gives two lists of overrides with one value each.
+    """Return one list of overrides per combination of values: `threshold.r=0,3` gives two lists.
 
-    Hydra's other syntax for values works, too, such as `range(0,4)`.
+    Hydra's other syntax for several values works, too, such as `range(0,4)`.
     """
     from hydra.errors import HydraException
 

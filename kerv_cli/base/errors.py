@@ -35,7 +35,7 @@ _LISTED = 24  # names that a message lists
 
 
 class UnknownName(UsageError):
-    """A name does not exist. The message suggests similar names, or lists known names (24 at most), then a `remedy`."""
+    """A name does not exist. The message suggests similar names, else lists up to 24 known ones, and adds `remedy`."""
 
     def __init__(self, kind: str, name: str, names: Iterable[str], remedy: str = "") -> None:
         names = list(names)
@@ -57,14 +57,14 @@ class Interrupted(KervError):
 
 
 def is_of_an_interrupt(error: BaseException | None) -> bool:
-    """Return whether Ctrl-C caused an error: libraries can turn it into an error of their own."""
+    """Return whether Ctrl-C caused an error. Libraries can replace a KeyboardInterrupt by an error of their own."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
 
 
 class EpisodeError(KervError):
-    """One episode failed, for example by a wrong answer of a server. Other episodes of its setting go on."""
+    """One episode failed, for example because a server answered wrongly. The setting's other episodes go on."""
 
 
 class RenderingUnavailable(KervError):

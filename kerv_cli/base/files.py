@@ -106,7 +106,7 @@ def _exchange(a: Path, b: Path) -> None:
 
 @contextlib.contextmanager
 def owned(path: Path, check: Callable[[], object]) -> Iterator[None]:
-    """Hold a lock of the operating system on a path that the block makes. `check`, called with it, may refuse."""
+    """Hold a lock while the block makes `path`, so that no other command does. `check` runs under the lock."""
     with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         file = path.with_name(f".{path.name}.lock").open("a")
@@ -120,7 +120,7 @@ def owned(path: Path, check: Callable[[], object]) -> Iterator[None]:
 
 
 def unfinished(folder: Path) -> Path:
-    """Return the hidden folder in which a training is made that replaces `folder` once it is complete."""
+    """Return the hidden path beside `folder` where a training is kept until it is complete and replaces `folder`."""
     folder = folder.resolve()  # a link to a folder on another disk stays one
     return folder.with_name(f".{folder.name}.new")
 
@@ -189,7 +189,10 @@ def read_mapping(path: Path) -> dict[str, Any]:
 
 
 def read_yaml_lines(path: Path, what: str) -> tuple[dict[str, Any], dict[str, int]]:
-    """Read a YAML file that contains a mapping. Return it, and the line of each key, such as `threshold.r`."""
+    """Read the mapping in a YAML file. Return the mapping, and the line number of each key, such as `threshold.r`.
+
+    `what` names the file in errors.
+    """
     import yaml
 
     lines: dict[str, int] = {}

@@ -18,8 +18,8 @@ def setting(default: Any, help: str = "", **metadata: Any) -> Any:
     """Return a field of a settings dataclass.
 
     `default` is the value, or a function (such as a dataclass) that makes it. `help` is one line for `--help` and
-    `--cfg`. Further facts: `limits` (see the function), `names` (the allowed values), and `group`, the part that is
-    chosen by default for a field that is named like a folder of conf/.
+    `--cfg`. `metadata` can have `limits` (from the function `limits`), `names` (the allowed values) and `group`: for a
+    field named like a folder of conf/, the choice in this folder that is the default.
     """
     metadata |= {"help": help} if help else {}
     if callable(default):
@@ -56,7 +56,7 @@ def check_label(label: str) -> str:
 
 
 def check_settings(settings: Any, what: str = "") -> None:
-    """Check all values in a settings dataclass and in the dataclasses inside it. `what` names it in error messages.
+    """Check all values in a settings dataclass and in the dataclasses inside it. In errors, `what.` precedes each key.
 
     If a dataclass has a method `check_together(prefix)`, it is called to check settings that depend on each other.
     """

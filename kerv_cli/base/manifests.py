@@ -24,7 +24,7 @@ DIGEST = "digest"  # field of a JSON file with the SHA-256 of all its other fiel
 def read(kind: type[T], value: Any, what: str, tolerant: bool = False) -> T:
     """Convert a JSON value to a dataclass, whose fields may be dataclasses, too. `what` names the value in errors.
 
-    With `tolerant`, unknown fields, which a newer version of kerv may have written, are ignored, else an error.
+    An unknown field is an error. With `tolerant` it is ignored, because a newer version of kerv may have written it.
     """
     try:
         checked: T = _converted(kind, value, "", tolerant)
@@ -99,16 +99,17 @@ def _digest_of(fields: Mapping[str, Any]) -> str:
 
 
 def content_of(key: Sequence[str], chunk: int, target: str, files: Mapping[str, str]) -> str:
-    """Return the SHA-256 that determines what a datastore finds (docs/formats.md).
+    """Return a SHA-256 over everything that determines what a search in a datastore finds (docs/formats.md).
 
-    `key` names the parts of the prompt, `target` and `files` are hashes.
+    `key` names the parts of the prompt that make the search key. `chunk` is the number of control steps per chunk.
+    `target` and the values of `files` are hashes.
     """
     text = json.dumps([key, chunk, target, sorted(files.items())])
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def check_files(folder: Path, files: Mapping[str, str], again: str) -> None:
-    """Check that files have their SHA-256. `again` says in the error message what to do if one has changed."""
+    """Check that the files in a folder still have their SHA-256. `again` tells in the error what to do if not."""
     for name, digest in files.items():
         if sha256_of(folder / name) != digest:
             raise CheckpointError(f"{folder / name} does not match its manifest: {again}")

@@ -66,7 +66,7 @@ def shipped_dir() -> Path:
 
 
 def find_target(results: str, name: str) -> Path:
-    """Return the folder of a target: a path if `name` has a slash, else of the results folder, else a shipped one."""
+    """Return a target's folder. `name` is a path if it has a slash, else the name of a trained or shipped target."""
     policies = results_dir(results) / "pretrained"
     folders = [artifact_or_path(results, "target", name)]
     if "/" not in name:
@@ -92,7 +92,7 @@ def find_target(results: str, name: str) -> Path:
 
 
 def check_free(path: Path, setting: str, replace: bool) -> None:
-    """Refuse to replace what another command made, unless `replace=true` was typed. `setting` chooses another name."""
+    """Refuse an existing file or folder unless `replace`. The error suggests another value of the key `setting`."""
     if not replace and (path.is_file() or visible(path)):
         raise UsageError(f"{path} is there already: choose another {setting}=NAME, or type replace=true to replace it")
 
@@ -106,7 +106,7 @@ def new_target(results: str, name: str) -> Path:
 
 
 def check_not_shipped(path: Path, word: str) -> None:
-    """Refuse to replace an artifact of a shipped policy. The setting `word` chooses another folder."""
+    """Refuse to replace an artifact of a shipped policy. The error suggests another value of the key `word`."""
     made_here = (path / RESUME).is_file()
     if path.exists() and (path.parent / "target" / "target.json").is_file() and not made_here:
         raise UsageError(f"{path} is there, as a part of a shipped policy: {word}=NAME makes one of yours")

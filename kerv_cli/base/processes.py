@@ -20,7 +20,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA
 def begin_worker(parent: int) -> None:
     """Prepare this process as a worker. The worker ignores Ctrl-C, which its parent handles.
 
-    The worker ends at most a few seconds after its parent. On Linux the kernel ends it, also when the thread that
+    The worker ends at most a few seconds after its parent. On Linux the kernel also ends a worker when the thread that
     started it ends. So start workers from a thread that lives as long as they do. Libraries that are imported later
     compute in one thread, because the workers share the cores.
     """

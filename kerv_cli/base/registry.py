@@ -141,7 +141,7 @@ class Part:
         return self.settings(kind=self.name)
 
     def check_code(self, group: str, coded: bool) -> None:
-        """Refuse a part that compares tokens by distance, if the tokens are `coded`, so that they have none."""
+        """Refuse a part that compares tokens by distance if the tokens are `coded` (FAST): these have no distance."""
         if coded and not (self.absent or self.any_code):
             raise UsageError(
                 f"{group}={self.name}: it needs a distance between tokens, and the target's code has none; choose a "
@@ -180,7 +180,7 @@ class ProposerPart(Part):
         has_boundary: Whether a boundary chooses between retrieval and a drafter.
         looks_up: Whether it searches a datastore.
         cost: Kind of cost under which a latency profile gives the seconds of a draft. Empty if it has no cost.
-        measured_by: Name of the method whose decodes measure this cost. Empty if no method does.
+        measured_by: Name of the method that `kerv bench` runs to measure this cost. Empty if it measures none.
     """
 
     kind = "proposer"
@@ -335,7 +335,7 @@ def parts(kind: str, module: str = "") -> Mapping[str, Part]:
     """Return the parts of a kind by name, in the order of registration.
 
     `kind="drafter"` returns the artifacts that have settings, because only these are trained. With `module`, a name in
-    MODULES, only this one of kerv's own modules is imported.
+    MODULES, no other module of kerv is imported.
     """
     load_plugins()
     if kind == "drafter":

@@ -75,13 +75,13 @@ class TaskSettings(RunSettings):
 
 
 def choices_of(schema: type) -> dict[str, str]:
-    """Return the groups of conf/ that a command uses, with their defaults. Of two that set a key, the later wins."""
+    """Return the default choices of a command's groups of conf/. If two choices set a key, the later one wins."""
     parts = {at.name: str(at.metadata["group"]) for at in fields(schema) if "group" in at.metadata}
     return parts | dict(getattr(schema, "groups", {}))
 
 
 def read_settings(schema: type[S], plain: Mapping[str, Any]) -> S:
-    """Return settings from nested dicts and lists, the inverse of `asdict`. A part's become its own settings class."""
+    """Return settings from nested dicts and lists, the inverse of `asdict`. Each part gets its own settings class."""
     settings = manifests.read(schema, plain, "a stored setting")
     for group in SETTINGS_GROUPS:
         value = getattr(settings, group, None)

@@ -211,7 +211,7 @@ class ActionSpace:
         return self.normalised_tokens(self.normalise(chunks))
 
     def normalised_tokens(self, chunks: np.ndarray) -> np.ndarray:
-        """Return what `chunk_tokens` returns, for chunks (n, H, D) of normalised actions."""
+        """Return the tokens (n, N) int64, like `chunk_tokens`, of chunks (n, H, D) of normalised actions."""
         if self.code is None:
             return self.bins_of(chunks).reshape(len(chunks), -1)
         return self.code.encode(self.code.coefficients(chunks))
@@ -230,10 +230,10 @@ class ActionSpace:
         return replace(self, low=low, high=high)
 
     def check_same(self, other: ActionSpace, here: str, there: str, statistics: bool = False) -> None:
-        """Refuse another action space with other names, groups, strict DoFs, bins or control rate.
+        """Refuse an action space that differs in names, groups, strict DoFs, bins or control rate.
 
-        With `statistics`, also another `low`, `high`, `end_token` or `code`: then the same token means another action.
-        `here` and `there` say in the error message what the two spaces belong to.
+        With `statistics`, also refuse another `low`, `high`, `end_token` or `code`, with which a token means another
+        action. `here` and `there` say in the error message what the two spaces belong to.
         """
         normalisation = ("low", "high", "end_token", "code") if statistics else ()
         for name in ("names", "groups", "strict", "bins", "control_hz", *normalisation):

@@ -24,7 +24,7 @@ Message = Mapping[str, Any]
 
 
 def packed(value: object, text_keys: bool = False) -> bytes:
-    """Encode a message with msgpack. The keys of an array's map are texts in vla-eval, bytes in openpi."""
+    """Encode a message with msgpack. The keys of an array's map are texts (`text_keys`, vla-eval) or bytes (openpi)."""
     import msgpack
 
     def plain(value: object) -> object:

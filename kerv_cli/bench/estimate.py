@@ -1,4 +1,4 @@
-"""Compute what verified drafts can give a policy, from its size or from measured costs. Nothing is run; no torch."""
+"""Compute how much verified drafts can speed up a policy, from its size or from measured costs. It needs no torch."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ _CHANCES = 1000  # probabilities that the search for the break-even distinguishe
 
 @dataclass(frozen=True)
 class Draft:
-    """A lossless method: `chain` tokens per round of the drafter, or the whole chunk, verified in the prefill."""
+    """A lossless method. A round drafts `chain` tokens. If 0, the prefill verifies one draft of the whole chunk."""
 
     method: str
     chain: int = 0
     source: str = ""  # kind of cost of a draft of the whole chunk; empty: it costs nothing
 
     def seconds(self, profile: Profile, tokens: int, chance: float) -> float:
-        """Return the mean seconds of a decode of `tokens` tokens, each draft token accepted with probability `chance`.
+        """Return the mean seconds of a decode of `tokens` tokens. `chance`: probability that a draft token is accepted.
 
         After a rejection, the drafter drafts again. Without a drafter, the target decodes the rest alone.
         """
@@ -68,7 +68,7 @@ DRAFTS = (Draft("last_action"), Draft("one_pass_strict", source="early"), Draft(
 
 
 def shape_of(weights: str) -> tuple[Shape, str]:
-    """Return the shape of a policy of this size (`7B`, or a name in SHAPES), and what was assumed about it."""
+    """Return a policy's shape, and a text with its assumptions. `weights`: `7B` or the like, or a name in SHAPES."""
     if weights in SHAPES:
         return SHAPES[weights], ""
     total = number_of(weights)
@@ -91,7 +91,7 @@ def number_of(text: str) -> float:
 
 
 def language_of(weights: float) -> Language:
-    """Return a Llama whose layers and head have about this many weights, between those of PUBLISHED."""
+    """Return the shape of a Llama with about this many weights in layers and head, interpolated from PUBLISHED."""
     sizes, layers, vocabularies = np.log(np.array(PUBLISHED)).T
     at = math.log(weights)
     small = weights < _SMALL
@@ -103,7 +103,7 @@ def language_of(weights: float) -> Language:
 
 
 def estimate(settings: EstimateSettings) -> Iterator[dict[str, Any]]:
-    """Yield for each machine its `machine`, `tokens`, `engines`, `notes`, `rate` and `sentence`, ready for JSON."""
+    """Yield one dictionary per machine for JSON: machine, tokens, engines, notes, sentence; with `hz` also rate."""
     tokens = settings.tokens or (30 if settings.code == "fast" else 7)
     found: dict[str, list[NamedProfile]] = {}
     assumed = ""
@@ -134,7 +134,7 @@ def estimate(settings: EstimateSettings) -> Iterator[dict[str, Any]]:
 
 
 def engine_of(costs: NamedProfile, tokens: int, acceptance: Sequence[float]) -> dict[str, Any]:
-    """Return what an action costs part by part, and the speeds of drafts against it."""
+    """Return a dictionary for JSON: the times of the parts of a chunk under AR, and the speed of each draft over AR."""
     profile = costs.profile
     parts = []
     for part, kind, seconds in (
@@ -164,7 +164,7 @@ def break_even(draft: Draft, profile: Profile, tokens: int) -> float | None:
 
 
 def sentence(engines: Sequence[dict[str, Any]], tokens: int, settings: EstimateSettings) -> str:
-    """Say how much verified drafts can give at most, and what pays first. The first engine counts."""
+    """Say how much verified drafts can speed up the first engine at most, and which two changes gain most."""
     best, worst = engines[0], engines[-1]
     chance = f"{sorted(settings.accepted)[len(settings.accepted) // 2]:g}"
     gains = {}

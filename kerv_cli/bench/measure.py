@@ -222,7 +222,7 @@ def costs_of(
 
 
 def phases_of(seconds: Mapping[Key, Sequence[float]], sizes: Sizes, machine: Machine) -> Iterator[Phase]:
-    """Summarise the measured seconds of each repeat as phases, and yield these in the order of a decode."""
+    """Yield a Phase per kind and number of rows, in the order of a decode. `seconds` has the times of all repeats."""
     order = (*FORWARDS, *source_methods())
     prompt = min(rows for kind, rows in seconds if kind == "prefill")
     for kind, rows in sorted(seconds, key=lambda key: (order.index(key[0]), key[1])):

@@ -156,7 +156,7 @@ class Sizes:
 
     @classmethod
     def of(cls, language: Language, number: float) -> Sizes:
-        """Return the sizes of a Llama-style target and of its drafter, which has one layer of the same shape."""
+        """Return the sizes of a Llama-style target and its one-layer drafter. `number`: bytes of a weight."""
         width, layers = language.hidden_size, language.num_hidden_layers
         layer = 4 * width**2 + 3 * width * language.intermediate_size
         head, channels, cached = width * language.vocab_size, layers * width, 2 * layers * width
@@ -235,9 +235,9 @@ def priced(shape: Shape, device: Device, engine: Engine) -> Profile:
 
 
 def encoder_of(towers: Sequence[Tower], width: int) -> Needs:
-    """Return what OpenVLA's encoder needs.
+    """Return what one run of OpenVLA's vision encoder needs. `width` is the language model's.
 
-    In each tower it runs all blocks but the last. A projector of three layers follows.
+    Each tower runs all its blocks but the last. A projector of three layers follows.
     """
     weights, flops, blocks, channels = 0.0, 0.0, 0, 0
     for tower in towers:

@@ -1,4 +1,4 @@
-"""Compute what a model's decodes cost on GPUs that are not here. docs/measuring.md has published times. No torch."""
+"""Compute what a model's decodes cost on GPUs that this machine lacks. It needs no torch."""
 
 from __future__ import annotations
 

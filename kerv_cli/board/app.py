@@ -37,7 +37,7 @@ LAST_ANSWERS = 1.0
 class SameOrigin:
     """Refuse requests that change something, if the page of another site sends them.
 
-    Browsers send the header Origin with every such request. Programs such as curl do not send it, and may pass.
+    Browsers send the header Origin with every such request. Programs such as curl send none, and are let through.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -53,7 +53,7 @@ class SameOrigin:
 
 
 def make_app(database: Database) -> Starlette:
-    """Return the web app of a database and its results folder. Pages find it in `request.app.state.database`."""
+    """Return the web app of a database and its results folder. `request.app.state.database` is the database."""
     folders = {"/static": ("kerv_cli.board", "static"), "/report": ("kerv_cli.report", "templates")}
     files = [Mount(path, StaticFiles(packages=[folder])) for path, folder in folders.items()]
     app = Starlette(
@@ -66,7 +66,7 @@ def make_app(database: Database) -> Starlette:
 
 
 def failed(request: Request, error: Exception) -> Response:
-    """Return the page for an error. Its status is 404 if something does not exist, 500 if something is damaged."""
+    """Return the page for an error. An HTTPException keeps its status. A UsageError gets 404, any other error 500."""
     if isinstance(error, HTTPException):
         return render(request, "error.html", error.status_code, reason=error.detail)
     reason = str(error) if isinstance(error, KervError) else f"internal error, {type(error).__name__}: {error}"

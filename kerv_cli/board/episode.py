@@ -1,4 +1,4 @@
-"""The page of one episode: its film, what became of every token, its times, its recording, and how it is recorded."""
+"""The page of one episode: its film, the outcome of every token, its times, and the button that records it."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _film(request: Request) -> Film:
 
 
 def command_of(found: FoundEpisode) -> tuple[str, str]:
-    """Return (command, reason): the command that repeats an episode, or why there is none. The other is empty."""
+    """Return the command that repeats an episode, or why no command does: (command, "") or ("", reason)."""
     from kerv_cli.episodes.resolve import repeating_words
 
     episode, results = found.episode, str(found.store.database.results)
@@ -109,7 +109,7 @@ def _film_values(
 
 
 def show_film(request: Request) -> Response:
-    """Show an episode's film, or the button that records it, or how long it has been recorded."""
+    """Show an episode's film, or the button that records it, or for how long its recording has been running."""
     return render(request, "episode_film.html", **_film_values(request, _found(request)))
 
 
@@ -155,7 +155,7 @@ _VIEWER_CONTENT = (
 def viewer_files() -> dict[str, tuple[bytes, str]]:
     """Return content and media type of each file of Rerun's web viewer, by the file's name.
 
-    Rerun's package offers them only through its own web server, which is started for a moment, for this machine alone.
+    Only the web server in Rerun's package offers these files. It is started for a moment, for this machine alone.
     """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -92,13 +92,13 @@ class Grid:
     total: int  # also those that have not run
 
     def columns(self, label: str) -> Markup:
-        """Return a row's cells as HTML. A template takes five times as long for 10,000 of them."""
+        """Return a row's cells as HTML. Rendering 10,000 cells in a template would take five times as long."""
         row = self.rows[label]
         return Markup("".join([f"<td>{row.get(seed, '')}</td>" for seed in self.seeds]))
 
 
 def cells_of(rows: Sequence[Any], baseline: str, settings: Mapping[str, Setting]) -> list[Cell]:
-    """Return a cell for every row of `outcomes`. Its kind compares the outcome with the baseline's."""
+    """Return a cell for each row from `outcomes`. Its kind says how the episode compares with the baseline's."""
     references = references_of(list(settings.values()), baseline)
     names = {}
     for label, one in settings.items():
@@ -140,7 +140,7 @@ def grids_of(cells: Sequence[Cell]) -> list[Grid]:
 def clusters_of(cells: Sequence[Cell]) -> list[tuple[list[Cell], int]]:
     """Group failures by task, setting and phase, the largest group first.
 
-    Each comes with the number of all episodes of its task and setting that have run.
+    Each group comes with the number of episodes of its task and setting that have run.
     """
     groups: dict[tuple[str, ...], list[Cell]] = defaultdict(list)
     ran: Counter[tuple[str, str]] = Counter()
@@ -152,7 +152,7 @@ def clusters_of(cells: Sequence[Cell]) -> list[tuple[list[Cell], int]]:
 
 
 def _asked(request: Request) -> tuple[list[Cell], dict[str, Any]]:
-    """Return the study's episodes, of the setting and task that the address names, and values for the templates."""
+    """Return the cells of the study, setting and task in the address, and further values for the templates."""
     store = Study(database_of(request), request.path_params["name"])
     study = loaded(store, episodes=False)
     baseline, settings = study.baseline, {one.label: one for one in study.settings}

@@ -47,10 +47,10 @@ def database_of(request: Request) -> Database:
 
 
 def refreshed(page: Callable[[Request, str, bool], Response]) -> Callable[[Request], Response]:
-    """Decorate a function that makes a page which the browser asks for again and again.
+    """Decorate a function that makes a page which the browser requests again and again.
 
-    It is called only if the database has changed since, with the database's version, and whether any command is
-    running.
+    The function is called only if the database has changed since the last request. It gets the request, the database's
+    version, and whether any command is running.
     """
 
     @functools.wraps(page)
@@ -70,7 +70,7 @@ def render(request: Request, template: str, status: int = 200, **values: Any) ->
 
 
 def inside(request: Request, path: Path) -> Path:
-    """Resolve the symbolic links of a path, which must be in the results folder."""
+    """Resolve the symbolic links of a path. Answer 404 if it then is not an existing path in the results folder."""
     resolved = path.resolve()
     if not resolved.is_relative_to(database_of(request).results.resolve()) or not resolved.exists():
         raise HTTPException(404, "no such file in the results folder")

@@ -37,7 +37,7 @@ class Job:
 
 
 class Recorder:
-    """Records episodes. Asking for an episode that is being recorded already does nothing."""
+    """Records episodes. A request for an episode that is already being recorded is ignored."""
 
     def __init__(self) -> None:
         self._jobs: dict[Path, Job] = {}
@@ -73,9 +73,9 @@ RECORDER = Recorder()
 
 
 def record_episode(found: FoundEpisode) -> str:
-    """Run an episode again and write its recording. Return the error in one line, empty if it was written.
+    """Run an episode again and write its recording. Return an error as one line, or an empty text on success.
 
-    If the setting's skip rule adapts from episode to episode, the episodes before it run first.
+    If the setting's skip rule adapts from episode to episode, the episodes before this one run first.
     """
     from kerv_cli.episodes.runner import Runner
     from kerv_cli.lab.work import checked, failure_of

@@ -100,7 +100,7 @@ def _parts(database: Database, name: str, version: str, is_running: bool) -> tup
 
 @refreshed
 def show_study(request: Request, version: str, is_live: bool) -> Response:
-    """Show how far a study is. The tables follow in a second request, because many episodes take time to read."""
+    """Show the progress of a study. A second request loads the tables, because many episodes take time to read."""
     database = database_of(request)
     runs = find_runs(database)
     run = next((run for run in runs if run.id == request.path_params["name"] and run.has_episodes), None)

@@ -125,7 +125,7 @@ def _with_command(entry: RunEntry, row: Any, is_finished: bool) -> RunEntry:
 
 
 def find_run(database: Database, name: str, exact: bool = False) -> RunEntry:
-    """Return one entry: by its id, by a part that no other id contains unless `exact`, or `last` for the newest."""
+    """Return the entry with an id. Unless `exact`, a unique part of the id is enough, and `last` means the newest."""
     runs = find_runs(database)
     if not runs:
         raise UsageError(f"no runs in {database.results}: make one with 'kerv rollout method=spec_vla task=reach'")
@@ -147,7 +147,8 @@ def find_run(database: Database, name: str, exact: bool = False) -> RunEntry:
 def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry]:
     """Return the entries that match every filter.
 
-    `kind` is the exact kind, `method` and `task` are names or patterns such as `drawer*`, `state` begins a state.
+    `kind` is the exact kind. `method` and `task` are names or patterns such as `drawer*`. `state` is the beginning of a
+    state.
     """
     for key in filters:
         if key not in _FILTERS:
@@ -281,7 +282,7 @@ def _made_from(value: Mapping[str, Any], provenance: Mapping[str, Any]) -> dict[
 
 
 def parents(run: RunEntry, runs: Sequence[RunEntry]) -> dict[str, str]:
-    """Return what an entry was made from, by kind: ids of entries, `shipped` policies, or 12 digits of a hash."""
+    """Return what an entry was made from, by kind: an entry's id, `shipped NAME`, or else 12 digits of a hash."""
     names = {other.sha256: other.id for other in runs}
     for folder in visible(shipped_dir()):
         for kind in artifact_kinds():

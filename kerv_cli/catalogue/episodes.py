@@ -19,9 +19,9 @@ LARGEST_ID = 2**31 - 1
 
 
 def outcomes(store: Study, task: str = "", seed: int | None = None) -> list[Any]:
-    """Return one row for every label, task and seed of a study, in the study's order.
+    """Return one row per planned episode of a study (label, task and seed), in the study's order.
 
-    `episode` is a row number, None if it has not run. `failed`: whether the last attempt to run it raised an error.
+    `episode` is the episode's row number, None if it has not run. `failed`: whether the last attempt to run it failed.
     """
     with store.database.reading() as connection:
         query = (
@@ -40,7 +40,7 @@ def outcomes(store: Study, task: str = "", seed: int | None = None) -> list[Any]
 
 
 def totals(store: Study) -> list[Any]:
-    """Return the totals of each setting's episodes, counted by the database, in the study's order."""
+    """Return one row per setting of a study, with sums over its episodes, such as successes, steps and seconds."""
     columns = [sa.func.sum(EPISODES.c[name]).label(name) for name in ("steps", "decodes", "forwards", "seconds")]
     successes = sa.func.sum(sa.cast(EPISODES.c.success, sa.Integer)).label("successes")
     query = (
@@ -75,7 +75,7 @@ class FoundEpisode:
         return self.store.rollouts / self.episode.recording
 
     def decodes(self) -> tuple[list[DecodeRecord], list[int]]:
-        """Read the episode's decodes, and the control step at which each executes its first action."""
+        """Read the episode's decodes, and for each the control step at which its first action is executed."""
         from kerv_cli.episodes.rows import decode_records
 
         table = decodes_of(self.store, [self.id])

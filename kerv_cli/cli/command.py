@@ -1,4 +1,4 @@
-"""Declare the commands of `kerv`: the decorator `command` turns a function into the command of that name.
+"""Declare the commands of `kerv`: the decorator `command` turns a function into a command.
 
 The decorator puts the function into kerv's registry. From that entry (a `Part` of kind `command`) this module makes
 typer's command with its options, settings and help. The function is written as for typer. kerv fills in
@@ -96,7 +96,6 @@ def commands(words: str = "") -> dict[str, Command]:
 
 
 def typer_command(part: Command) -> TyperCommand:
-    """Make a typer command from a registered command."""
     words = {**CONTEXT, "allow_extra_args": True}  # typer would import pydantic to parse arguments
     made = _made(part.code, name=part.name, cls=CommandWithSettings, help=part.help, context_settings=words)
     made.part, made.short_help = part, part.summary
@@ -119,7 +118,6 @@ def _with_settings(cfg: Cfg = False) -> None:
 
 
 def _split(part: Command, typed: list[str]) -> tuple[list[str], list[str]]:
-    """Divide what was typed into overrides and names."""
     keys = {*choices_of(part.settings), *fields_of(part.settings)}
     filters = set(re.findall(r"(\w+)=", part.help.partition("\n\nNAME: ")[2]))
     overrides, names = [], []

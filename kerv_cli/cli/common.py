@@ -83,16 +83,16 @@ def end_with_plan(text: str, as_json: bool = False) -> NoReturn:
 
 
 def end_at_once() -> NoReturn:
-    """End a server's process although threads compute: Python's own exit frees memory that C++ code still uses."""
+    """End this process although threads still compute. Python's own exit would free memory that C++ code still uses."""
     sys.stdout.flush()
     os._exit(0)
 
 
 @contextmanager
 def one_line_errors(words: Sequence[str]) -> Iterator[None]:
-    """Print an exception of the block as one line, and exit with its code. `words`: what follows `kerv`.
+    """Print an exception of the block as one line, and exit with its code. `words`: the arguments after `kerv`.
 
-    The code is 2 for a command line that cannot be parsed, 130 for Ctrl-C, and 1 for what is no KervError. With
+    The code is 2 if the command line cannot be parsed, 130 after Ctrl-C, and 1 for an error that is no KervError. With
     KERV_TRACEBACK=1 the exception is raised again.
     """
     try:
@@ -148,7 +148,7 @@ def _refuse(message: str, code: int, error: BaseException | None, words: Sequenc
 
 
 def with_results(message: str, words: Iterable[str]) -> str:
-    """Add `results=` and `store=`, as typed, to the commands of kerv that a message quotes and that lack them."""
+    """Add `results=` and `store=`, as the user typed them, to each kerv command that a message quotes without them."""
     from kerv_cli.base.registry import parts
 
     where = results_word(words)
@@ -174,7 +174,7 @@ def database_of(settings: CommandSettings) -> Database:
 
 @contextmanager
 def made(plan: Plan[T], database: Database, show: bool = False, as_json: bool = False) -> Iterator[T]:
-    """Do the work of a plan, and yield its result. With `show`, print the plan and how long it takes, and end."""
+    """Carry out a plan, and yield its result. With `show`, only print the plan and its duration, and end."""
     from kerv_cli.lab import runs
 
     if show:
@@ -189,7 +189,7 @@ def progress_bar(title: str, record: Run | None = None, has_estimate: bool = Fal
     """Show a progress bar while the block runs. Without a terminal, print a line after each tenth of the work.
 
     Yield `advance(done, total, text="")`. The progress is also written to `record`, the command's row in the database.
-    With `has_estimate` the text says how much time is left, else the bar estimates it.
+    With `has_estimate`, `text` says how much time is left. Otherwise the bar estimates the time.
     """
     on_terminal = sys.stderr.isatty()
     latest = -1

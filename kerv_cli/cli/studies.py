@@ -68,7 +68,7 @@ def print_settings(resolved: ResolvedStudy) -> None:
 
 
 def print_study_plan(planned: Plan, as_json: bool, guess: float = SECONDS_PER_EPISODE) -> None:
-    """Print which episodes would run, why, and how long that would take. `guess`: seconds, if none was measured."""
+    """Print which episodes would run, why, and for how long. `guess`: seconds per episode if none was measured."""
     from kerv_cli.lab.workers import TimeLeft
 
     rows, to_run, reused, study = _plan_rows(planned), planned.to_run, planned.existing, planned.study
@@ -111,10 +111,10 @@ def run_plan(planned: Plan, guess: float = SECONDS_PER_EPISODE) -> Outcome:
 
 
 def event_printer(show: Callable[[int, int, str], None], left: TimeLeft | None = None) -> Callable[[Event], None]:
-    """Return a function that prints a line about each event of a running study and moves its progress bar by `show`.
+    """Return a function that prints a line about each event of a running study and updates the progress bar by `show`.
 
-    `left` is of the plan that begins now. If standard error is no terminal, only the first 100 episodes get a line
-    each.
+    `left` estimates the time of the plan that begins now; a worker has none. If standard error is no terminal, only the
+    first 100 episodes get a line each.
     """
     from kerv_cli.lab.work import BlockStarted, BlocksWait, Counted, Preparing, SettingFailed
 

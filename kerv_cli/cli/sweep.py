@@ -117,7 +117,7 @@ def _list_studies(as_json: bool) -> None:
 
 
 def tables(study: Study, outcome: Outcome) -> StudyData | None:
-    """Read the results of a sweep's episodes. None if it has none."""
+    """Read the results of a sweep's episodes. Return None if no episode has ended."""
     from kerv_cli.report.tables import load_study
 
     there = [*outcome.done, *outcome.reused]

@@ -106,7 +106,7 @@ def read_profile(path: Path) -> Profile:
 
 
 class Calls(NamedTuple):
-    """All m forwards, or all m drafts, that have one kind of cost in several decodes."""
+    """The m forwards or drafts of one kind of cost in several decodes."""
 
     decode: np.ndarray  # (m,) index of the decode that ran each forward or draft
     rows: np.ndarray  # (m,) number of tokens that each forward or draft processed, not counting the prompt's tokens
@@ -134,10 +134,11 @@ class Work:
 
 
 def work_of(rounds: Columns, counts: np.ndarray, phases: Columns, looked_up: np.ndarray, size: int) -> Work:
-    """Return what several decodes computed, from the columns of their records.
+    """Count the forwards and drafts of several decodes, from the columns of their records.
 
-    `rounds` has an array (n,) for each name in `COUNTED`, decode after decode, `phases` one (decodes,) for each name in
-    `READ_PHASES`. `counts` is the number of rounds of each decode, `size` the number of tokens N in a chunk.
+    `rounds` has for each name in `COUNTED` an array over all n rounds, decode after decode. `phases` has for each name
+    in `READ_PHASES` the seconds (decodes,). `counts` is the number of rounds of each decode, `looked_up` whether it
+    searched a datastore, `size` the number of tokens N in a chunk.
     """
     decodes, decode = len(counts), np.repeat(np.arange(len(counts)), counts)
     mode, proposer, start = rounds["mode"], rounds["proposer"], rounds["start"]

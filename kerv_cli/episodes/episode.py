@@ -37,8 +37,9 @@ def steps_during(seconds: float, control_hz: float) -> int:
 class RealClock:
     """Tells an episode how long each decode takes, and how many of the decoded actions are then too old to execute.
 
-    A constant latency (seconds) must leave something to execute: in an episode of `horizon` control steps, and with
-    compensation in a chunk of `chunk` steps. `expected` is the number of control steps that the last decode took.
+    A constant latency (seconds) is refused if it is as long as an episode (`horizon` control steps), or, with
+    compensation, as long as a chunk (`chunk` control steps). `expected` is the number of control steps that the last
+    decode took.
     """
 
     def __init__(

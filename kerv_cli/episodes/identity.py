@@ -97,7 +97,7 @@ def hash_of(value: object) -> str:
 
 
 def work_of(settings: Plain, identity: Identity) -> str:
-    """Return the hash of what determines results, except task and seed: settings, weights and data, and ENGINE."""
+    """Return the hash of all that determines results except task and seed: settings, weights, data and ENGINE."""
     policy = {"kind": settings["policy"]["kind"]}
     for name, value in without(identity, {OBSERVATION}).items():
         policy[f"{name}_sha256"] = value

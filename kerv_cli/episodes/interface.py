@@ -1,4 +1,4 @@
-"""How an observation becomes a message to a policy's server, and its answer becomes actions (docs/remote.md)."""
+"""How an observation becomes a message to a policy's server, and the answer becomes actions (docs/remote.md)."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Interface:
     kerv: bool = setting(False, "whether the server's metadata says all of this")
 
     def adapted(self, metadata: Message, execute: int = 0) -> Interface:
-        """Return the interface of a server: for kerv's, what its metadata says. `execute` has precedence unless 0."""
+        """Return a copy with `execute`, unless it is 0, and with what a kerv server says in its `metadata`."""
         own = replace(self, execute=execute or self.execute)
         if not self.kerv:
             return own
@@ -83,7 +83,7 @@ class Interface:
         return any(STATE in names for names in self.state.values())
 
     def check(self, spec: EnvironmentSpec, world: WorldSettings) -> None:
-        """Refuse an environment that lacks what the server reads, or moves otherwise than the server sends."""
+        """Refuse an environment that lacks what the server reads, or has other DoFs than the server's actions."""
         if self.environment not in ("", spec.name):
             raise UsageError(f"the server's policy is for {self.environment}, these tasks are of {spec.name}", "task")
         for picture in self.images.values():
@@ -108,7 +108,7 @@ class Interface:
         return {**message, self.prompt: observation.instruction}
 
     def actions_of(self, spec: EnvironmentSpec, answer: Message) -> tuple[np.ndarray, int]:
-        """Return the actions to execute (h, D) float32 in environment units, and how many the answer has."""
+        """Return the actions to execute (h, D), float32, environment units, and how many actions the server sent."""
         names, values = self.names or list(spec.actions.names), answer.get(self.actions)
         try:
             sent = np.asarray(values, np.float64)

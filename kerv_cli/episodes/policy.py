@@ -43,10 +43,10 @@ def artifacts_of(settings: MethodSettings) -> Artifacts:
 
 
 def check(settings: RolloutSettings, is_awaited: bool = False) -> dict[str, str]:
-    """Refuse settings that cannot run, before anything slow starts. Return the identity of what runs.
+    """Refuse settings that cannot run, before anything slow starts. Return the setting's identity.
 
-    It has hashes of weights and data by kind, and at `observation` what the policy observes. `is_awaited`: wait two
-    minutes for a server that does not answer.
+    The identity has hashes of weights and data, by kind, and under `observation` what the policy observes. With
+    `is_awaited`, a server that does not answer is tried for two minutes.
     """
     tasks = resolve_tasks(settings.task)
     spec = spec_of(tasks[0])
@@ -203,8 +203,8 @@ def warm_up(decoder: Follower, task: str, space: ObservationSpace, pixels: int, 
 class ExpertDecoder(Follower):
     """Returns one action at a time from the environment's scripted controller of a task.
 
-    The controller reads the privileged simulator state, as policies with `observation=state` do. It is no neural
-    policy: records have no forwards, rounds or tokens, and its time is not compared with a decoding method's.
+    The controller reads the privileged simulator state, as policies with `observation=state` do. A record has no
+    forwards, rounds or tokens, and its time is not compared with that of a decoding method.
     """
 
     def __init__(self, task: str) -> None:

@@ -43,7 +43,7 @@ class Server:
     """A policy's server, and this process's connection to it.
 
     Attributes:
-        metadata: What the server said when it was first reached, which may be nothing. None before.
+        metadata: The server's first message on the first connection, possibly empty. None before.
     """
 
     def __init__(self, url: str) -> None:
@@ -90,7 +90,7 @@ class Server:
         self._connection = None
 
     def find(self, since: float) -> None:
-        """Connect, and try again until RECONNECT_S after `since` (of time.monotonic) if the server was there before."""
+        """Connect. If the server was there before, try again until RECONNECT_S after `since` (of time.monotonic)."""
         try:
             metadata = self.reached(since, 0.0 if self.metadata is None else RECONNECT_S)
         except Lost as error:
@@ -99,7 +99,7 @@ class Server:
             raise KervError(f"{self.url} serves another policy now: its metadata has changed")
 
     def reached(self, since: float, patience: float) -> Message:
-        """Connect, for `patience` seconds after `since` unless that was in vain before. Return the metadata."""
+        """Connect and return the metadata. Try until `patience` s after `since`; only once after an earlier failure."""
         patience = 0.0 if self._given_up else patience
         is_said = False
         while True:
@@ -143,7 +143,7 @@ class Server:
         raise EpisodeError(f"{self.url} gave no answer within {ANSWER_S:g} s")
 
     def accounts(self, answer: Message) -> Served:
-        """Return the server's own time for this answer, and the tokens accepted since the previous one."""
+        """Return the server's own time for this answer, and its drafts and accepted tokens since the last answer."""
         seconds = math.nan
         for key in ("server_timing", "policy_timing"):
             timing = answer.get(key)
@@ -157,7 +157,7 @@ class Server:
 
 
 def _watch(connection: socket.socket) -> None:
-    """Let TCP end a connection whose other machine is gone for 20 seconds."""
+    """Make TCP end a connection if the other machine has been silent for 20 seconds."""
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for name, value in (("TCP_KEEPIDLE", 10), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 2)):
         if hasattr(socket, name):  # the names are Linux's
@@ -228,9 +228,10 @@ class RemoteDecoder(Follower):
         self._done += 1
 
     def decode(self, observation: Observation) -> DecodeRecord:
-        """Return a record with the server's actions. Its `seconds` are those from the observation to the actions.
+        """Return a record with the server's actions. Its `seconds` are the time from the observation to the actions.
 
-        If the server is away for a while, its memory of the episode begins anew, and `seconds` are of the last attempt.
+        If the connection was lost meanwhile, the server begins the episode anew, and `seconds` are those of the last
+        attempt.
         """
         for _ in range(self._asks):
             began, answer = self._answered(observation)

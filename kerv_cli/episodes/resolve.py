@@ -152,7 +152,10 @@ def _points(study: StudySettings, path: Path, typed: Collection[str]) -> dict[st
 
 @contextmanager
 def _line_of(path: Path, typed: Collection[str], place: str, others: Mapping[str, str] = {}) -> Iterator[None]:
-    """Add the study's file and line to a UsageError, unless a `typed` key is wrong. `others` maps settings to keys."""
+    """Prefix a UsageError with the study's file and a line, unless the user typed the wrong key (`typed`).
+
+    The line is that of the key `others[error.key]`, else of `place`.
+    """
     try:
         yield
     except UsageError as error:
@@ -163,7 +166,7 @@ def _line_of(path: Path, typed: Collection[str], place: str, others: Mapping[str
 
 
 def resolve_rollout(overrides: Sequence[str], multirun: bool) -> ResolvedStudy:
-    """Compose the settings of `kerv rollout`. With -m, compose one setting per combination of values in comma lists.
+    """Compose the settings of `kerv rollout`. With `multirun`, one per combination of values in comma lists.
 
     Every setting runs on all tasks. The baseline is the first autoregressive setting, else the first one. A label is
     the method's name, the parts that replace the method's own, and the values that vary.
@@ -235,8 +238,8 @@ def _is_ar(settings: RolloutSettings) -> bool:
 def idle_overrides(resolved: ResolvedStudy, sweep: bool = True) -> dict[str, str]:
     """Return the overrides that have no effect, each with the reason.
 
-    An override in the file of several settings is returned as `LABEL: KEY=VALUE`. One from the command line is returned
-    only if no setting reads it.
+    If there are several settings, one of a setting's own overrides is returned as `LABEL: KEY=VALUE`. An override from
+    the command line is returned only if no setting reads it.
     """
     reasons: dict[str, str] = {}
     in_each = []
@@ -299,7 +302,7 @@ def idle_keys(settings: RolloutSettings) -> dict[str, str]:
 
 
 def tasks_of(settings: RolloutSettings) -> tuple[str, ...]:
-    """Return the full names of a rollout's tasks, by default those of its target, else DEFAULT_TASKS."""
+    """Return the full names of a rollout's tasks. Default: the tasks its target was trained on, else DEFAULT_TASKS."""
     return resolve_tasks(settings.task or list(trained_tasks(settings)) or DEFAULT_TASKS)
 
 
@@ -328,7 +331,7 @@ def study_name(study: str) -> str:
 
 
 def located(words: Sequence[str]) -> list[str]:
-    """Return a command's words with the absolute paths of study and method files, to type them in any folder."""
+    """Return a command's words with absolute paths of study and method files, to run it from any folder."""
     found = []
     for word in words:
         key, _, name = word.partition("=")

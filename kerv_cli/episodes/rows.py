@@ -26,7 +26,7 @@ def _summed(value: Callable[[DecodeRecord], Any]) -> Callable[[EpisodeRecord], A
 
 
 def _judged(value: Callable[[Round], int], *served: str) -> Callable[[EpisodeRecord], int]:
-    """Sum a value over the rounds that verified a draft, and the attributes `served` that a server sends."""
+    """Return a function that sums `value` over verified rounds, plus the counts named `served` that a server sent."""
     return _summed(
         lambda decode: (
             sum(value(one) for one in decode.rounds if one.is_verification)
@@ -44,7 +44,7 @@ def _phase(phase: str) -> Callable[[DecodeRecord], float | None]:
 
 
 def _columns(*names: str, kind: pa.DataType = INT, read: Callable[[str], Any] = attrgetter, as_: str = "{}") -> Fields:
-    """Return a column for each name. `read(name)` reads its value from a record; `as_` is the pattern of its name."""
+    """Return a column for each name. `read(name)` reads the value from a record; `as_` is the pattern of the name."""
     return {as_.format(name): (kind, read(name)) for name in names}
 
 

@@ -1,7 +1,7 @@
 """Run episodes in the worlds (open environments) of this process: one after the other, or several at once.
 
 Settings in a process share weights, datastores and worlds. Each has its own decoder and renders its own images, so
-that none gains from another's caches.
+that no setting becomes faster through the caches of another.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Runner:
     """Runs episodes of one setting (a method with all its options) on one task. The decoder is built only once.
 
     The episodes may alternate with episodes of other runners, because decoders share no state. With `save`, the
-    episodes that the settings ask for are recorded and handed to this function.
+    episodes that the settings say to record are recorded and passed to `save`.
     """
 
     def __init__(
@@ -184,7 +184,7 @@ def is_recorded(settings: RolloutSettings, seed: int) -> bool:
 
 
 def success_of(target: Target, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:
-    """Return the share of successful episodes, one per task and seed. The target decodes as it was trained to."""
+    """Run one episode per task and seed, and return the share of successes. The target decodes as it was trained to."""
     decoder = BatchDecoder(native_decoder(target))
     requests = [Request(None, task, seed) for task, seed in itertools.product(tasks, seeds)]
     outcomes = []

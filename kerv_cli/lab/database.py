@@ -42,7 +42,7 @@ class Damaged(ValueError):
 
 
 class _Text(sa.types.TypeDecorator[str]):
-    """Text. What databases refuse, such as NUL, is written as an escape."""
+    """Text. Characters that databases refuse, such as NUL, are stored as escapes."""
 
     impl = sa.Text
     cache_ok = True
@@ -66,7 +66,7 @@ def _required(kind: Any, *names: str) -> list[sa.Column[Any]]:
 
 
 def _to(name: str, column: str, **options: Any) -> sa.Column[Any]:
-    """Return a column that refers to a row of another table. If that row is deleted, rows that refer to it are, too."""
+    """Return a column that refers to a row of another table. Deleting that row deletes the rows that refer to it."""
     return sa.Column(name, sa.ForeignKey(column, ondelete="CASCADE"), **options)
 
 
@@ -144,7 +144,7 @@ WANTED = _table(
     sa.Column("anew", sa.Boolean, nullable=False, default=False),  # rerun=all: stored episodes do not count
 )
 UNFINISHED = sa.and_(WANTED.c.block.is_not(None), WANTED.c.episode_id.is_(None), WANTED.c.error.is_(None))
-"""Condition: the row waits for a worker, or has one. A row with neither block, episode nor error is not asked for."""
+"""Condition: the row's episode waits for a worker, or runs. Rows without a block are not in the queue."""
 for _name, _columns in {"wanted_blocks": ("study_id", "block"), "wanted_workers": ("worker",)}.items():
     sa.Index(_name, *(WANTED.c[one] for one in _columns), sqlite_where=UNFINISHED, postgresql_where=UNFINISHED)
 _IS_THERE = WANTED.c.episode_id.is_not(None)
@@ -338,7 +338,7 @@ def _file(path: Path) -> sa.Engine:
 class _Connection(sqlite3.Connection):
     """A connection that rolls back before it is closed.
 
-    Ctrl-C can leave a cursor open, which keeps the transaction of a closed connection.
+    Ctrl-C can leave a cursor open. An open cursor would keep the transaction after the connection is closed.
     """
 
     def close(self) -> None:
@@ -372,7 +372,7 @@ def _begin(connection: sa.Connection) -> None:
 
 
 def roll_back() -> None:
-    """Roll back what Ctrl-C has left open in this thread: a transaction whose end it kept from running."""
+    """Roll back the transaction that Ctrl-C has left open in this thread, if there is one."""
     before: sqlite3.Connection | None = getattr(_begun, "connection", None)
     if before is not None:
         with contextlib.suppress(sqlite3.ProgrammingError):  # it is closed, as it should be

@@ -138,9 +138,9 @@ def split(
     Args:
         episodes: The study's episodes.
         block: Number of seeds in a block, which one process runs.
-        stored: Episodes in the database, by `Episode.key`: their `id`, and their block with its `started` and `seeds`.
-        known: Rows of the table WANTED that the study has already. A row keeps its episode. A row that ALL has emptied
-            stays empty until it has run.
+        stored: Rows of stored episodes, by `Episode.key`, with `id`, `block`, and the block's `started` and `seeds`.
+        known: The study's rows in the table WANTED. A row that has an episode keeps this episode. A row that an earlier
+            ALL has emptied counts as missing until it has run.
         rerun: Which existing episodes to run again, NEVER or ALL.
         earlier: The newest stored setting by label. Used to explain what has changed.
 
@@ -183,7 +183,6 @@ def _reasons(
 
 
 def grouped(episodes: Iterable[Episode], key: Callable[[Episode], K]) -> dict[K, list[Episode]]:
-    """Group episodes by the value that `key` returns for each of them."""
     groups: dict[K, list[Episode]] = {}
     for one in episodes:
         groups.setdefault(key(one), []).append(one)

@@ -1,4 +1,4 @@
-"""The rows of a study as one worker sees them: claim a block, note what begins, write what ended, give up what failed.
+"""The queue of a study, as one worker sees it: claim a block, and write which episodes begin, end or fail.
 
 Every method is one transaction, and a database has one writer at a time. A claim lasts as long as the worker's
 heartbeat, and every write checks that the rows still belong to the worker.
@@ -35,7 +35,7 @@ from kerv_cli.lab.store import IS_NO_ROLLOUT, RAN, ROLLOUT, Study, setting_of
 T = TypeVar("T")
 
 MOST_DEATHS = 3
-"""After so many workers have died in an episode, its setting fails in the block."""
+"""If this many workers have died during an episode, its setting fails in the block."""
 PATIENCE_SECONDS = 120.0
 """Seconds for which a worker tries to reach a database that does not answer."""
 
@@ -49,7 +49,7 @@ class Claim:
     """Episodes that this worker runs.
 
     Attributes:
-        run: Id of the command with which they are stored.
+        run: Id of the command under which the episodes are stored.
         block: The episodes.
         deadly: An episode in which MOST_DEATHS workers have died. None if there is none.
     """
@@ -65,7 +65,7 @@ class Queue:
     Args:
         study: The study. Only its database, name and kind matter.
         worker: Name of the worker in the table WORKERS.
-        run: Id of the command for which it works. If empty, the study's newest command.
+        run: Id of the command for which the worker runs episodes. If empty, the study's newest command.
     """
 
     def __init__(self, study: Study, worker: str, run: str = "") -> None:
@@ -77,9 +77,10 @@ class Queue:
         self._settings: dict[int, Setting] = {}
 
     def claim(self) -> Claim | None:
-        """Claim the free rows of the first block that has some. Return None if there is none now.
+        """Claim the free rows of the first block that has some. Return None if no row is free now.
 
-        Rows whose episode another study has stored meanwhile are linked to it. The block of the claim may be empty.
+        If another study has stored a row's episode meanwhile, the row is linked to that episode, and this worker does
+        not run it. So the block of the claim may be empty.
         """
         with self.database.writing() as connection:
             others = self._others(connection)
@@ -117,7 +118,7 @@ class Queue:
         ).all()
 
     def _busy(self, connection: sa.Connection, others: Sequence[str]) -> Sequence[int]:
-        """Return the blocks with an episode that a worker runs now for another study: it will be linked."""
+        """Return the blocks with an episode that a worker runs for another study. Its result will be reused."""
         episode = SETTINGS.c.work, WANTED.c.task, WANTED.c.seed
         query = sa.select(*episode).select_from(PLANNED).where(WANTED.c.worker.in_(others), UNFINISHED)
         query = query.where(STUDIES.c.kind != ROLLOUT, STUDIES.c.id != self.number)
@@ -158,14 +159,14 @@ class Queue:
             raise ClaimLost("the worker was silent for too long, or the study was deleted")
 
     def begin(self, one: Episode, before: Episode | None = None) -> None:
-        """Note that an episode, or the preparation of its setting, begins. `before` is what was noted last."""
+        """Note that an episode, or the preparation of its setting, begins. The note of `before` is taken back."""
         with self.database.writing() as connection:
             if before is not None:
                 self._change(connection, before, attempts=WANTED.c.attempts - 1)
             self._change(connection, one, attempts=WANTED.c.attempts + 1)
 
     def survive(self, one: Episode) -> None:
-        """Take back that this worker died in an episode which another worker has claimed meanwhile."""
+        """Take back one counted death: this worker lives, although another worker has claimed its episode meanwhile."""
         with self.database.writing() as connection:
             counted = sa.update(WANTED).where(self._rows(one), UNFINISHED, WANTED.c.attempts > 0)
             connection.execute(counted.values(attempts=WANTED.c.attempts - 1))
@@ -202,7 +203,7 @@ class Queue:
                 self._change(connection, one, sa.true(), error=error, attempts=0)
 
     def left(self, plan: Study | None = None) -> int:
-        """Return the number of unfinished episodes of the study, or of those that a plan of the study has."""
+        """Return the number of unfinished episodes of the study. With `plan`, count only the episodes of this plan."""
         query = sa.select(SETTINGS.c.work, WANTED.c.task, WANTED.c.seed).distinct().select_from(WANTED.join(SETTINGS))
         if plan is not None:
             seeds = [one.seed for one in plan.episodes]

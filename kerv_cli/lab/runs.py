@@ -1,4 +1,4 @@
-"""Commands that were started (runs), one row each, and who lives: a row per command and worker, with a heartbeat.
+"""The tables of commands that were started (runs), and of living commands and workers, each with a heartbeat.
 
 Times are those of the database's own clock, because the clocks of two machines may differ. Each process also holds a
 lock on a file. The operating system gives the lock back when the process ends, however it ends, so a process of this
@@ -45,14 +45,14 @@ RUNNING, COMPLETE, FAILED, INTERRUPTED = "running", "complete", "failed", "inter
 BEAT_SECONDS = 5.0
 """Seconds between two heartbeats."""
 LAPSE_SECONDS = 30.0
-"""Seconds without a heartbeat after which others may run what a worker has claimed."""
+"""Seconds without a heartbeat after which other workers may run a worker's claimed episodes."""
 _FORGET_SECONDS = 86_400.0
 _FOLDER = ".workers"
 
 
 @functools.cache
 def _machine() -> bytes:
-    """Return what is the same for all processes of a kernel: two containers may have one host name."""
+    """Return an id of this machine's running kernel. A host name would not do, because two containers can share one."""
     with contextlib.suppress(OSError):
         return Path("/proc/sys/kernel/random/boot_id").read_bytes().strip()
     return socket.gethostname().encode()
@@ -87,18 +87,18 @@ def _was_killed(path: Path) -> bool:
 
 
 def beats(connection: sa.Connection) -> sa.ColumnElement[bool]:
-    """Return the condition that a row of WORKERS had a heartbeat lately."""
+    """Return the SQL condition that a row of WORKERS has a recent heartbeat."""
     return WORKERS.c.heartbeat >= clock(connection) - LAPSE_SECONDS
 
 
 def living(database: Database, connection: sa.Connection) -> dict[str, str]:
-    """Return the name of each living command and worker, with the id of the command for which it works."""
+    """Return the names of all living commands and workers, each with the id of the command for which it works."""
     rows = connection.execute(sa.select(WORKERS.c.name, WORKERS.c.run).where(beats(connection)))
     return {name: run for name, run in rows if not _was_killed(_lock_of(database, name))}
 
 
 def bury(database: Database) -> None:
-    """Remove the rows of killed processes of this machine, so that others may run what these had claimed."""
+    """Remove the rows of killed processes of this machine, so that other workers may run their claimed episodes."""
     with database.reading() as connection:
         names = connection.scalars(sa.select(WORKERS.c.name)).all()
     dead = [name for name in names if _was_killed(_lock_of(database, name))]
@@ -112,11 +112,11 @@ def bury(database: Database) -> None:
 class Presence:
     """Tells others that this process lives, from the start to the end of a `with` statement.
 
-    At the end, rows that it has claimed and not finished become free.
+    At the end, episodes that the process has claimed and not finished become free.
 
     Args:
-        database: Where others look.
-        run: Id of the command for which it works. If empty, any command.
+        database: Database in which this process is listed.
+        run: Id of the command for which the process works. If empty, any command.
     """
 
     def __init__(self, database: Database, run: str = "") -> None:
@@ -138,7 +138,7 @@ class Presence:
         self.beat_in(connection)
 
     def beat_in(self, connection: sa.Connection) -> None:
-        """Write a sign of life, in a transaction."""
+        """Write a heartbeat, in the open transaction of `connection`."""
         beaten = sa.update(WORKERS).where(WORKERS.c.name == self.worker).values(heartbeat=clock(connection))
         if not connection.execute(beaten).rowcount:
             row = {"name": self.worker, "run": self.run, "host": socket.gethostname()}
@@ -178,9 +178,10 @@ def _rows(database: Database, connection: sa.Connection, *where: sa.ColumnElemen
 
 
 def run_rows(database: Database, kind: str = "", name: str = "") -> Sequence[Any]:
-    """Return the rows of the commands that were started, newest first. A running command that is dead is interrupted.
+    """Return the rows of the commands that were started, newest first.
 
-    The column `seen` is a running command's newest sign of life, seconds since 1970.
+    A running command whose process is dead has the status `interrupted`. The column `seen` is a running command's
+    newest heartbeat, in seconds since 1970.
 
     Args:
         database: The database.
@@ -328,7 +329,7 @@ def making(database: Database, kind: str, folder: Path) -> Run:
 
 
 def command_to_go_on(database: Database, kind: str, folder: Path) -> tuple[str, ...]:
-    """Return the arguments after `kerv` that resume the making of an artifact (weights or data).
+    """Return the arguments after `kerv` that resume a command which makes an artifact (weights or data).
 
     Empty if the artifact is complete, or if the database has no row for it.
     """
@@ -337,7 +338,7 @@ def command_to_go_on(database: Database, kind: str, folder: Path) -> tuple[str, 
 
 
 def interrupted(database: Database, kind: str, command: Sequence[str]) -> str:
-    """Return the name in the newest row of a command (without `kerv`) if it did not complete."""
+    """Return the name of what a command's newest run was making. Empty if that run completed, or if there is none."""
     row = next((row for row in run_rows(database, kind) if row.command == list(command)), None)
     return "" if row is None or row.status == COMPLETE else str(row.name)
 

@@ -59,7 +59,7 @@ class Study:
         episodes: All episodes, in the order in which they run.
         title: Title of the report.
         baseline: Label of the setting that the others are compared with.
-        axis: Configuration key on the x axis of plots. If empty, they show speed and success of each setting.
+        axis: Configuration key on the x axis of plots. If empty, plots show speed and success of each setting.
         note: A sentence printed in the report.
         block: Number of seeds in a block, which one process runs. For each of these seeds it runs all settings.
         machines: Names of cost profiles of other machines, on which the report estimates the speeds.
@@ -142,7 +142,7 @@ def studies(database: Database) -> list[Study]:
 
 
 def loaded(study: Study, episodes: bool = True) -> Study:
-    """Return the study as it was planned last. `episodes=False` leaves out its episodes, which take time."""
+    """Return the study with its newest plan. `episodes=False` leaves out the episodes, which take long to read."""
     row = row_of(study)
     if row is None:
         stored = [study.name for study in studies(study.database)]
@@ -178,7 +178,7 @@ def rows_of(connection: sa.Connection, name: str) -> Sequence[Any]:
 RAN = EPISODES.join(BLOCKS).outerjoin(RUNS, RUNS.c.id == BLOCKS.c.run)
 """Each stored episode with the command that ran it."""
 IS_NO_ROLLOUT = sa.func.coalesce(RUNS.c.kind, "") != ROLLOUT
-"""Condition: a sweep may use the episode. In a rollout no other setting took turns with it."""
+"""Condition: no rollout ran the episode. Sweeps reuse only such episodes."""
 
 
 def stored_episodes(connection: sa.Connection, study: Study) -> dict[Key, list[Any]]:
@@ -235,8 +235,8 @@ def whole_runs(study: Study) -> list[str]:
 def frame_of(study: Study, episodes: Iterable[Episode] | None = None, run: str | None = None) -> pd.DataFrame:
     """Return the episodes that have been run, in the study's order: one row per label, task and seed.
 
-    It has the columns of the table `episodes` (`decode_seconds` as an array, `initial_state` as a tuple), `run`, and
-    the machine and versions that ran the episode.
+    The frame has the columns of the table `episodes` (`decode_seconds` as an array, `initial_state` as a tuple),
+    `run`, and the machine and versions that ran the episode.
 
     Args:
         episodes: Only these episodes; None for all.

@@ -68,7 +68,7 @@ def is_elsewhere(runtime: RuntimeSettings) -> bool:
 
 
 def check(resolved: ResolvedStudy) -> tuple[Setting, ...]:
-    """Check the settings of a sweep or a rollout. Return them with the hashes of their weights, the baseline first."""
+    """Check that a study's settings can run. Return them with the hashes of weights and data, the baseline first."""
     check_writable(str(resolved.first.results))
     settings = []
     for label, one in resolved.settings.items():
@@ -95,7 +95,7 @@ def plan(
 
     Args:
         resolved: The study with all its settings.
-        settings: What `check` returns.
+        settings: The checked settings, from `check`.
         database: The database.
         command: Command-line arguments (without `kerv`) that resume the sweep or rollout.
         kind: SWEEP or ROLLOUT.
@@ -116,7 +116,7 @@ def plan(
 
 
 def _check_source(study: Study, command: Sequence[str]) -> None:
-    """Refuse a sweep if another file, which still exists, already describes a study of this name."""
+    """Refuse a sweep if a stored study of this name comes from another study file that still exists."""
     ours, theirs = (
         next((word.partition("=")[2] for word in words if word.startswith("study=")), "")
         for words in (command, swept_by(study))
@@ -167,12 +167,12 @@ def _earlier(connection: sa.Connection, labels: Sequence[str]) -> dict[str, Sett
 
 
 def save(plan: Plan, run: str = "") -> None:
-    """Write a plan, in one transaction: the study's settings, its rows, and the blocks of what must run.
+    """Write a plan in one transaction: the study, its settings, a row per episode, and the blocks to run.
 
-    If nobody else runs the study, rows outside the plan are removed, or not asked for any more. Sweeps over different
-    tasks give one report: rows of another task stay if their setting, the baseline and their seed are in the plan. If
-    somebody runs the study, nothing is taken away, and new rows get blocks of their own. A row that finished after
-    planning keeps its episode.
+    If no other process runs the study, rows outside the plan are removed. Only rows of other tasks stay, so that sweeps
+    over different tasks give one report. They stay if their setting, the baseline and their seed are in the plan, but
+    they are no longer run. If another process runs the study, no row is removed, and new rows get blocks of their own.
+    A row whose episode ended after planning keeps the episode.
 
     Args:
         plan: The plan.
@@ -247,7 +247,7 @@ def _is_unfinished(row: Mapping[str, Any]) -> bool:
 
 
 def _still_asked_for(rows: Mapping[Any, dict[str, Any]], wanted: Iterable[tuple[int, str, int]]) -> dict[Any, Any]:
-    """Return the rows of other tasks that stay beside a plan. Nobody runs them."""
+    """Return the rows of tasks outside the plan that stay in the study. Unfinished ones leave the queue."""
     tasks, seeds = set[str](), defaultdict[int, list[int]](list)
     for number, task, seed in wanted:
         tasks.add(task)
@@ -271,10 +271,10 @@ def _check_orders(study: Study, to_run: Mapping[Episode, object]) -> None:
 
 
 def _save_settings(connection: sa.Connection, study: Study, is_shared: bool) -> tuple[int, dict[str, int]]:
-    """Write a study's row and its settings. Return the number of the row, and the numbers of the settings by label.
+    """Write a study's row and its settings. Return the row's number, and the settings' row numbers by label.
 
-    Unless somebody runs the study, settings that it has no longer are deleted with their rows, and so is a setting that
-    has another hash now. All are, if the baseline is among these.
+    Unless another process runs the study, stored settings that it no longer has, or that have another hash now, are
+    first deleted with their rows in WANTED. If the baseline is among them, all settings are.
     """
     about = {name: getattr(study, name) for name in ABOUT}
     number = _put(connection, STUDIES, {"name": study.name}, {"kind": study.kind, "created": now(), "about": about})
@@ -313,15 +313,15 @@ def _put(connection: sa.Connection, table: sa.Table, key: Mapping[str, Any], val
 
 
 def _other_commands(study: Study, alive: Mapping[str, str], run: str) -> sa.ColumnElement[bool]:
-    """Return the condition that another living command makes the study."""
+    """Return the SQL condition that another living command runs the study."""
     others = RUNS.c.id.in_(set(alive.values()) - {run})
     return sa.exists().where(RUNS.c.kind == study.kind, RUNS.c.name == study.name, others)
 
 
 def withdraw(plan: Plan, run: str) -> None:
-    """Let rows that nobody runs lose their block, so that workers anywhere end when theirs does.
+    """Take the study's unfinished episodes out of the queue, so that workers elsewhere end.
 
-    If another command makes the study, nothing is taken away.
+    Episodes that those workers run now stay. If another command runs the study, nothing changes.
     """
     study = plan.study
     with study.database.writing() as connection:

@@ -61,7 +61,7 @@ class BlockStarted:
 
 @dataclass(frozen=True)
 class Preparing:
-    """A worker builds the decoder of a setting: the setting with this number among the `of` settings of a block."""
+    """A worker builds the decoder of a setting: number `number` of the `of` settings in its block."""
 
     setting: Setting
     number: int
@@ -70,7 +70,7 @@ class Preparing:
 
 @dataclass(frozen=True)
 class BlocksWait:
-    """Other processes run all episodes that are left, so many, or nobody does. In case a process dies, it waits."""
+    """No episode is free to run: other workers run the `episodes` left, or nobody does if `has_workers` is false."""
 
     episodes: int
     has_workers: bool = True
@@ -78,7 +78,7 @@ class BlocksWait:
 
 @dataclass(frozen=True)
 class Counted:
-    """How many of a study's episodes have neither ended nor failed, wherever they run."""
+    """`left` of a study's episodes have neither ended nor failed, wherever they run."""
 
     left: int
 
@@ -113,7 +113,7 @@ Event = BlockStarted | Preparing | BlocksWait | EpisodeEnd | SettingFailed | Cou
 OnEvent = Callable[[Event], None]
 
 Tend = Callable[[int], object]
-"""Function to call again and again with the number of episodes that are left: it looks after the workers."""
+"""Function that looks after the workers. Call it again and again with the number of episodes left."""
 
 
 @dataclass
@@ -138,8 +138,8 @@ def follow(plan: Plan, record: Run, tend: Tend, prepare: Prepare, on_event: OnEv
 
     Args:
         plan: The plan.
-        record: The row of this command.
-        tend: What `workers` yields.
+        record: The `Run` of this command.
+        tend: Looks after the workers, from `workers`.
         prepare: Builds a setting's decoder for a task. Used in this process only.
         on_event: Called with each event, to show progress.
     """
@@ -242,7 +242,7 @@ def work(
     """Claim and run blocks (groups of episodes), one after another, until none is left.
 
     If a setting fails, the failure is reported and the other settings go on. While other workers run all blocks that
-    are left, wait: if one of these workers dies, its block is free again.
+    are left, wait, because the block of a worker that dies is free again.
 
     Args:
         queue: The blocks.
@@ -298,7 +298,6 @@ class _Attempt:
     order: int = 0
 
     def run(self) -> None:
-        """Run the block, until it has ended or its claim is lost."""
         block = self.claim.block
         self.left = list(block.turns())
         self.id = f"{self.claim.run}-{secrets.token_hex(4)}"

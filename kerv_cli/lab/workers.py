@@ -1,4 +1,4 @@
-"""A command that runs a plan, and its workers: processes of `kerv work` here, or wherever a command starts them.
+"""Run a plan with workers: processes of `kerv work`, on this machine or wherever `runtime.launch` starts them.
 
 Workers on this machine end when the sweep ends, even if the sweep is killed. Others end when no block is left.
 """
@@ -52,7 +52,7 @@ GPUS = "CUDA_VISIBLE_DEVICES"
 def begun(plan: Plan) -> Iterator[Run]:
     """Write the row of a command that runs a plan, for a `with` block.
 
-    If the block raises an exception, what nobody runs is not asked for any more.
+    If the block raises an exception, the study's waiting episodes leave the queue.
     """
     study = plan.study
     with Run(study.database, study.kind, study.name, plan.command, len(plan.to_run), study.kind == ROLLOUT) as run:
@@ -96,7 +96,7 @@ def run(plan: Plan, on_event: OnEvent = lambda event: None, *, write: Save = lam
 def gpus_in_turn(plan: Plan) -> list[str]:
     """Return one value of CUDA_VISIBLE_DEVICES per GPU. Workers get these values in turn.
 
-    Empty if the workers see the same GPUs as this process: not all settings run on `cuda`, the GPU without a number.
+    Empty if some setting runs on another device than `cuda`. Then every worker sees the same GPUs as this process.
     """
     if {one.setting.settings["runtime"]["device"] for one in plan.to_run} != {"cuda"}:
         return []
@@ -118,7 +118,7 @@ def workers(plan: Plan, run: str, say: Callable[[str], object] = lambda line: No
         say: Prints a line.
 
     Yields:
-        A function for `follow`. It frees what killed workers had claimed, and replaces them.
+        A function for `follow`. It frees the episodes that killed workers had claimed, and replaces these workers.
     """
     runtime, study = plan.runtime, plan.study
     # a cluster's jobs find `kerv` where this process runs, also when its folder is not on the user's PATH
@@ -149,7 +149,7 @@ def _launch(line: str, environment: dict[str, str]) -> None:
 
 @contextlib.contextmanager
 def _local_workers(plan: Plan, run: str, environment: Mapping[str, str]) -> Iterator[Tend]:
-    """Keep processes of `kerv work` at work during a `with` block.
+    """Keep processes of `kerv work` running during a `with` block.
 
     Each reads from a pipe that nobody writes to. When this process ends, even if it is killed, the pipe is closed, and
     the workers end.
@@ -204,7 +204,7 @@ def _end(process: subprocess.Popen[bytes], log: IO[bytes]) -> None:
 
 
 class TimeLeft:
-    """Estimates how long the missing episodes of a plan take: at first from stored episodes, then from their pace.
+    """Estimates how long the missing episodes of a plan take: first from stored episodes, then from the current pace.
 
     Args:
         plan: The plan.

@@ -131,7 +131,7 @@ class Result:
 
     @property
     def speed(self) -> float:
-        """Speed per episode relative to the baseline, which itself has 1. NaN if the speed was not measured."""
+        """Speed per episode relative to the baseline. 1 for the baseline, NaN if the speed was not measured."""
         return 1.0 if self.is_baseline else self.measures.episode_speedup.value
 
     def columns(self) -> Row:
@@ -139,7 +139,7 @@ class Result:
 
 
 def columns_of(values: Mapping[str, Any]) -> Row:
-    """Return named values as columns.
+    """Flatten named values into the columns of one row.
 
     An `Estimate` NAME becomes NAME, NAME_low and NAME_high. `PairedCounts` become the column `pairs` (their number) and
     one column per outcome. A mapping becomes one column per key.
@@ -193,7 +193,7 @@ def measure(
     Args:
         episodes: One row per episode. Columns: those of rows.EPISODE_SCHEMA, `label`, `decode_seconds`, `run`, `block`,
             and those of `COMPARABLE`.
-        pairs: From `paired`.
+        pairs: Pairs of these episodes with the baselines', from `paired`.
         by: OVERALL or PER_TASK.
         speeds: Speedups by group. If None, `speedups` computes them from `pairs`.
     """
@@ -285,7 +285,7 @@ def speedups_of_runs(runs: Sequence[pd.DataFrame], by: Sequence[str], same_pairs
     """Return the speedups of each group of pairs, with intervals over the runs, or over episodes if there is one run.
 
     Args:
-        runs: One table made by `paired` per run.
+        runs: For each run, the pairs from `paired`.
         same_pairs: Whether all runs measured the same pairs.
     """
     combined, *others = [speedups(pairs, by) for pairs in runs]

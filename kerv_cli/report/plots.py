@@ -112,7 +112,7 @@ def _lighter(colour: str, share: float) -> str:
 
 
 def lines_of(results: Sequence[Result], axis: str) -> Places:
-    """Return for each label the line that joins its point to others, and the setting's value on the x axis.
+    """Return for each label the name of the line through its point, and the point's x value.
 
     Settings that differ only in the value of `axis` share a line. A setting without such neighbours has its label as
     line, and x is None.

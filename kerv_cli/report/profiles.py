@@ -56,7 +56,7 @@ class NamedProfile:
         return profiles
 
     def check(self, tokens: int, kinds: Iterable[str] = (), setting: str = "") -> None:
-        """Refuse a profile that lacks a kind of cost, or costs for chunks of N `tokens`, for a `setting`."""
+        """Refuse a profile that lacks one of `kinds` or is for chunks below `tokens` tokens. Errors name `setting`."""
         command = f"kerv bench target={self.profile.about.get('target', 'TARGET')} tokens={tokens}"
         if lacks := self.profile.lacks(kinds):
             reason = f"no cost of '{lacks[0]}'" + (f", which setting '{setting}' needs" if setting else "")
@@ -69,7 +69,7 @@ class NamedProfile:
 
 
 def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfile]:
-    """Read cost profiles: names are paths, files in <results>/bench, or profiles that kerv ships."""
+    """Read cost profiles. A name is a path, a file in <results>/bench, or a profile that kerv ships."""
     folders = (Path(results) / "bench", shipped_dir().parent / "bench")
     profiles = []
     for name in names:

@@ -164,7 +164,7 @@ def csv_rows(data: StudyData, results: Sequence[Result]) -> list[Row]:
 
 
 def further_of(data: StudyData) -> dict[str, Any]:
-    """Return what a study's CSV files leave out, as JSON values (docs/formats.md)."""
+    """Return the values of a study that its CSV files leave out, for JSON (docs/formats.md)."""
     labels: dict[str, Any] = {}
     for row in [*data.results, *data.task_results]:
         setting = data.settings[row.label]

@@ -34,8 +34,8 @@ class Priced:
 
     result: Result  # the setting's row, as measured
     machine: NamedProfile
-    measures: Measures  # the same, estimated for the machine
-    # speeds per episode under other times of the vision encoder, by key of `ENCODERS`. Empty if it is known.
+    measures: Measures  # the setting's measures, estimated for the machine
+    # speeds per episode under other times of the vision encoder, by key of `ENCODERS`. Empty if its time is known.
     encoders: Mapping[str, float]
 
 
@@ -98,9 +98,9 @@ def _estimated(data: StudyData, works: Mapping[str, _LabelWork], profile: Profil
 
 
 def own_profiles(data: StudyData, elsewhere: bool = True) -> list[NamedProfile]:
-    """Return the profiles of the machines that ran the study, if `kerv bench` measured there.
+    """Return the cost profiles that `kerv bench` measured on the machines that ran the study.
 
-    Estimates beside the measured times show how accurate the cost model is. Missing profiles are left out.
+    Estimates next to the measured times show how accurate the cost model is. Missing profiles are left out.
 
     Args:
         elsewhere: Whether to include the machines that the study's file names.
@@ -148,7 +148,7 @@ def _work_of_label(data: StudyData, label: str) -> _LabelWork:
 
 
 def _priced(episodes: pd.DataFrame, work: _LabelWork, profile: Profile) -> pd.DataFrame:
-    """Return the episodes with the `seconds` and `decode_seconds` of their decodes at a profile's costs."""
+    """Return the episodes with estimates from a profile in the columns `seconds` and `decode_seconds`."""
     seconds = prices(work.work, profile)
     total = np.bincount(work.episode, seconds, len(episodes))
     order = np.argsort(work.episode, kind="stable")

@@ -41,7 +41,7 @@ MOST_PAIRS = 10_000
 def wilson(successes: float, episodes: float) -> Estimate:
     """Estimate a success rate with its Wilson score interval (Newcombe, Statistics in Medicine 17, 1998, method 3).
 
-    It is written out here because importing `scipy.stats` takes 60 MB of memory.
+    The formula is written out here because importing `scipy.stats` takes 60 MB of memory.
     """
     if episodes == 0:
         return NO_ESTIMATE
@@ -117,7 +117,8 @@ def speedup(baseline: np.ndarray, method: np.ndarray, strata: ArrayLike, blocks:
     The 95 % interval is computed for the ratio's logarithm, linearised, in a stratified cluster sample (Cochran,
     Sampling Techniques, 1977). The strata are the tasks. The clusters are blocks: episodes that ran together in one
     process and so share the state of the machine. If every task has only one block, the tasks are the clusters. If
-    there is only one block in all, its pairs are. The interval then holds only for the state that the machine was in.
+    there is only one block in all, its pairs are the clusters. The interval then holds only for the state that the
+    machine was in.
 
     Args:
         baseline: (pairs,) time of the baseline's episodes, in any unit.
@@ -143,7 +144,7 @@ def over_runs(estimates: Sequence[Estimate], same_pairs: bool) -> Estimate:
 
     The 95 % interval is computed for the logarithm, by Student's t with k − 1 degrees of freedom. If all runs have the
     same pairs, their spread does not show how much the choice of pairs matters. Then the mean of the runs' half widths
-    is added to this half width, in quadrature.
+    is added to this interval's half width, in quadrature.
 
     Args:
         same_pairs: Whether all runs measured the same pairs. If not, each run has its own seeds.

@@ -1,4 +1,4 @@
-"""Turn a study's table into tables that people read, in the terminal and on the page, and explain their names."""
+"""Turn a study's rows into tables that people read, in the terminal and on the page, and explain the columns."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def _speed(row: Result, speed: Estimate) -> str:
 
 
 def cells_of(row: Result) -> Cells:
-    """Return a row of a study's table as text, by heading. The first `MAIN` are always shown."""
+    """Return a row of a study's table as text, by heading. The first `MAIN` columns are always shown."""
     of = row.measures
     return {
         "setting": row.label,
@@ -175,7 +175,7 @@ class SummaryTable:
 
 
 def note_of(results: Sequence[Result], names: Sequence[str] = ()) -> str:
-    """Return the note below a table. It explains only the columns in `names`; if empty, all columns with values."""
+    """Return the note below a table. It explains the columns in `names`, or, if empty, all columns with values."""
     shown = columns_shown(summary(results)) & set(names or cells_of(results[0]))
     notes = ["In brackets: 95 % intervals."]
     if any(row.is_compared for row in results):
@@ -206,7 +206,7 @@ def _heading(name: str) -> str:
 
 
 def _parts(rows: Sequence[Cells], names: Sequence[str], width: int) -> Iterator[list[str]]:
-    """Cut a table's columns into parts that fit into `width` characters. The first has label, success, speed."""
+    """Cut a table's columns into parts of at most `width` characters. The first part has label, success and speed."""
     widths = {name: 2 + max(map(len, [*_heading(name).split("\n"), *(row[name] for row in rows)])) for name in names}
     labels = " ".join(row["setting"] for row in rows)
     label = min(widths["setting"], 2 + max(_LABEL, *map(len, labels.split())))
@@ -220,7 +220,7 @@ def _parts(rows: Sequence[Cells], names: Sequence[str], width: int) -> Iterator[
 
 
 def not_in_turn(results: Sequence[Result]) -> list[str]:
-    """Return the labels of timed settings without a speedup: none of their episodes ran in one block with its pair."""
+    """Return the labels of timed settings without a speedup, because no episode ran in a block with the baseline's."""
     apart: dict[str, None] = {}
     for row in results:
         of = row.measures
@@ -233,7 +233,7 @@ def not_in_turn(results: Sequence[Result]) -> list[str]:
 
 
 def setting_tables(data: StudyData) -> Iterator[tuple[Any, Any, str]]:
-    """Yield column names, rows and title of the tables of a study with one setting: per task, per phase of a decode."""
+    """Yield columns, rows and title of each table of a study with one setting: per task, and per phase of a decode."""
     episodes, setting = data.episodes, data.study.settings[0]
     rows = []
     for row in [*data.task_results, *data.results]:
@@ -263,7 +263,7 @@ def setting_tables(data: StudyData) -> Iterator[tuple[Any, Any, str]]:
 
 
 def task_table(results: Sequence[Result]) -> list[Cells]:
-    """Return the page's table of successes and speeds, by task and setting. The longer list has the rows."""
+    """Return the page's table of successes and speeds. Rows are tasks, or settings if there are more settings."""
     cells: dict[tuple[str, str], str] = {}
     for row in results:
         speed = row.measures.episode_speedup.value

@@ -103,7 +103,7 @@ class StudyData:
     def unstressed(self) -> dict[str, str]:
         """For each setting's label, the label of the same setting without stress.
 
-        If the study does not run that, the first setting that differs only in stress and `rollout.*`.
+        If the study lacks that setting, it is the first one that differs only in stress and `rollout.*`.
         """
         first, found = dict[str, str](), {}
         for setting in sorted(self.study.settings, key=lambda one: stress_of(one.settings)["level"] > 0):
@@ -213,7 +213,7 @@ def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyDa
 
 
 def _with_new_seeds(episodes: pd.DataFrame) -> list[pd.DataFrame]:
-    """Return one table per run, the oldest first. Empty if runs share a seed, or one lacks a setting on a task."""
+    """Return one table per run, the oldest first. Empty if runs share a seed, or if a run lacks a setting on a task."""
     worlds = episodes[["run", "task", "seed"]].drop_duplicates()
     cells = episodes[["run", "label", "task"]].drop_duplicates()
     every = cells["label"].nunique() * cells["task"].nunique()

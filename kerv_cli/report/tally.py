@@ -124,7 +124,7 @@ class Tally:
 
 
 def rates(reached: np.ndarray, accepted: np.ndarray) -> list[float | None]:
-    """Return accepted ÷ reached tokens. None if no token was reached."""
+    """Return `accepted` ÷ `reached`, entry by entry. An entry is None if `reached` is 0."""
     quotients: list[float | None] = (accepted / np.maximum(reached, 1)).tolist()
     for position in np.flatnonzero(reached == 0):
         quotients[position] = None

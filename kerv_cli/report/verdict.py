@@ -149,7 +149,7 @@ def sentence(choice: Choice, loss: float, baseline: str) -> str:
 
 
 def order_of(by_speed: Sequence[tuple[str, stats.Estimate]]) -> str:
-    """Return the settings as text in the order of their speed per episode. `≈`: not shown which is faster.
+    """Return the settings as text in the order of their speed per episode. `≈`: either may be faster.
 
     Args:
         by_speed: The settings, the fastest first, each with its speed relative to the next slower setting.

@@ -36,7 +36,7 @@ Steps = NDArray[np.int64]
 
 
 class _Log:
-    """Writes data to a Rerun recording, by path in the viewer. `hz`: control steps per simulated second."""
+    """Writes data to a Rerun recording. `hz`: control steps per simulated second."""
 
     def __init__(self, recording: rr.RecordingStream, hz: float) -> None:
         self.recording = recording

@@ -123,7 +123,7 @@ def outcomes_of(decode: DecodeRecord, size: int, dofs: int) -> list[TokenOutcome
 
 
 def acceptance(decodes: Iterable[DecodeRecord]) -> tuple[float, ...]:
-    """Return the mean committed and accepted tokens per verification (docs/methods.md §7). Empty without one."""
+    """Return the mean committed and accepted tokens per verification (docs/methods.md §7). Empty if there is none."""
     rounds = itertools.chain.from_iterable(map(attrgetter("rounds"), decodes))
     verifications = list(filter(attrgetter("is_verification"), rounds))
     counts = list(map(attrgetter("committed", "accepted"), verifications))

@@ -136,7 +136,7 @@ class Film:
 
 
 def film_of(path: Path) -> Film:
-    """Read the images of a recording. The latest four recordings are kept in memory."""
+    """Read the images of a recording. The four films that were read last stay in memory."""
     changed = path.stat().st_mtime_ns if path.exists() else 0
     return _read(path, changed)
 
