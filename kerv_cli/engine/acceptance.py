@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 
 class Accepted(NamedTuple):
-    """What an acceptance rule accepts of a draft, and the node that it rejects.
+    """Result of an acceptance rule: the accepted path of a draft, and the rejected node after that path.
 
     Attributes:
         path: Indices of the accepted nodes, from depth 0 down. Empty if none was accepted.
-        rejected: Index of the rejected node after the path. Of several, the one nearest to the target's.
-            None if the path ends at a leaf.
+        rejected: Index of the rejected node after the path. If there are several, the one whose token is nearest to
+            the target's token. None if the path ends at a leaf.
     """
 
     path: tuple[int, ...]
@@ -46,11 +46,13 @@ def accept_by_group(
 
     The tokens of one group (such as position or rotation) in one control step are accepted together or not at all. Each
     token's distance must be within the limit of its DoF, and the distances must sum to at most `group_limit`. A path
-    ends before a group that is only partly in the tree. If `start` is inside a group, only its other tokens are judged.
+    ends before a group that is only partly in the tree. If `start` is inside a group, only the group's tokens from
+    `start` on are judged.
 
     Args:
         limits: Largest accepted distance per DoF, in bins.
         group_limit: Largest accepted sum of a group's distances, in bins.
+        bounds: For each DoF, the index of the first DoF of its group, and the index after the group's last DoF.
     """
     alive = [False] * len(tree)  # whether no limit is broken on the path to this node
     in_group = [0] * len(tree)  # distances summed within the node's group
@@ -120,7 +122,7 @@ class DistanceRule(Buildable):
         return accept_by_group(tree, target_tokens, start, limits, group_limit=max(limits), bounds=alone)
 
     def judge_after(self, tokens: Sequence[int], tree: TokenTree, target_tokens: Sequence[int], r: int) -> Accepted:
-        """Return what `judge` returns. A rule that also reads the committed `tokens` overrides this."""
+        """Judge a draft that follows the committed `tokens`. By default calls `judge` with the number of tokens."""
         return self.judge(tree, target_tokens, len(tokens), r)
 
 

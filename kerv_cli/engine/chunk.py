@@ -41,7 +41,7 @@ class Follower:
         task: Name of the running episode's task.
         path: Measured positions of the end effector, (3,) each, metres, oldest first.
         last: Tokens of the chunk that was decoded last.
-        planned: Normalised actions (D,) of that chunk for the control steps that are still to come.
+        planned: The last chunk's normalised actions (D,) that are not executed yet.
     """
 
     def __init__(self, space: ActionSpace, cameras: tuple[str, ...] = ()) -> None:
@@ -64,7 +64,7 @@ class Follower:
         raise NotImplementedError
 
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
-        """Store an action (D,) that was executed, environment units, and the position (3,) after it, metres."""
+        """Store an executed action (D,), environment units, and the end effector's position (3,) after it, metres."""
         self._executed = np.concatenate([self._executed, self.space.normalise(action)[None]])[-WINDOW:]
         self.path.append(np.asarray(end_effector))
         del self.planned[:1]
@@ -117,7 +117,7 @@ class TargetSide:
 
 @dataclass(eq=False)
 class Chunk:
-    """State of one decode. The parts of a method read it and return their results, which the decoder stores in it.
+    """State of one decode. The parts of a method read this state, and the decoder stores their results in it.
 
     Attributes:
         steps: H, number of control steps.
@@ -125,13 +125,13 @@ class Chunk:
             be accepted within these distances.
         choice: What the method's boundary decided about this chunk. None if the method has no boundary.
         tokens: The committed tokens.
-        judged: The draft that the last round verified. Empty if it verified none.
+        judged: The draft that the last round verified. Empty if that round verified no draft.
         forwards: Number of forwards of the target so far.
-        similarity: Cosine of the most similar entry of a datastore. None if no part searched.
+        similarity: Cosine similarity of the datastore's most similar entry. None if no part searched a datastore.
         reason: The skip rule's reason to skip or to verify.
         closed: The normalised actions (S, D) of S ≤ H control steps, if a rectifier ended the chunk early.
-        filled: The normalised values that a rectifier predicted, if decoding went on after it. The keys are the indices
-            of the tokens that they replace.
+        filled: The normalised values that a rectifier predicted, if decoding went on after the prediction. The keys are
+            the indices of the tokens that the values replace.
     """
 
     steps: int
@@ -175,7 +175,7 @@ class Chunk:
     def distance(self, tokens: Sequence[int], others: Sequence[int]) -> float:
         """Return the mean absolute difference of two token sequences from the chunk's start, normalised units.
 
-        It is infinite if they differ in a strict DoF, such as a gripper.
+        The result is infinite if the sequences differ in a strict DoF, such as a gripper.
         """
         first, second = np.array(tokens), np.array(others)
         if (first != second)[self.space.strict_tokens(len(first))].any():
@@ -183,7 +183,7 @@ class Chunk:
         return float(np.abs(self.space.values_of(first) - self.space.values_of(second)).mean())
 
     def targets_along(self, chain: Sequence[int]) -> list[int] | None:
-        """Return the target's predictions along a chain of the draft that the prefill verified. Call it in that round.
+        """Return the target's predictions along a chain of the prefill draft. Call this in the prefill's round only.
 
         Returns N − 1 or N tokens. None if the prefill verified fewer than N − 1 tokens of this chain.
         """
@@ -231,9 +231,9 @@ class Chunk:
         return found[: found.index(end) + 1] if end is not None and end in found else found
 
     def rectify(self, found: Rectified, with_target_token: bool) -> None:
-        """Commit the values that a rectifier predicted. The robot executes them without rounding.
+        """Commit the values that a rectifier predicted. The robot executes these values without rounding to tokens.
 
-        If decoding continues, the target reads the tokens that are nearest to these values.
+        If decoding continues, the target reads the tokens that are nearest to the values.
         """
         if not with_target_token:
             del self.tokens[-1]
@@ -247,7 +247,7 @@ class Chunk:
         self.tokens += self.space.bins_of(values).flatten()[start:].tolist()
 
     def actions(self) -> np.ndarray:
-        """Return the chunk's actions (S, D), float32, environment units. S < `steps` if a rectifier ended it early."""
+        """Return the chunk's actions (S, D), float32, environment units. S < `steps` if a rectifier ended the chunk."""
         return self.space.unnormalise(self.values(self.steps)).astype(np.float32)
 
     def values(self, steps: int) -> np.ndarray:

@@ -98,7 +98,7 @@ class Judged(NamedTuple):
 
     @property
     def rest(self) -> list[int]:
-        """The rejected node, and the draft after it. The target predicts there as if it had been committed."""
+        """The rejected node and a path below it, for which the target predicted as if the node were accepted."""
         return [] if self.rejected is None else self.tree.down_from(self.rejected)
 
 

@@ -217,7 +217,7 @@ class Decoder(Follower):
         stopwatch.lap("propose")
 
     def decode_plainly(self, chunk: Chunk, stopwatch: Stopwatch) -> None:
-        """Decode the remaining tokens without drafts, in one call of the target if it can (`ContinuesGreedily`)."""
+        """Decode the remaining tokens without drafts: in one call if the target is a `ContinuesGreedily`."""
         tokens = None
         if isinstance(self.target, ContinuesGreedily):
             tokens = self.target.continue_greedily(
@@ -230,7 +230,7 @@ class Decoder(Follower):
         stopwatch.lap("accept")
 
     def forward_singly(self, chunk: Chunk, stopwatch: Stopwatch) -> list[int]:
-        """Decode the remaining tokens with one forward each. The CPU reads them after the last forward.
+        """Decode the remaining tokens with one forward each. The CPU reads all tokens after the last forward.
 
         If an end token can end the chunk, the CPU reads each token right after its forward.
         """
@@ -256,7 +256,7 @@ class Decoder(Follower):
         return draft
 
     def verify(self, chunk: Chunk, draft: Draft) -> Verified:
-        """Run the target once, over the tokens that are not in its cache yet (first the prompt) and the draft."""
+        """Run the target once, over the draft and the tokens before it that are not cached yet, such as the prompt."""
         target, cache, uncached = self.target, chunk.target.cache, chunk.target.uncached(chunk.tokens)
         before = len(uncached) or chunk.target.prompt_length
         positions, seen = draft.positions(cache.length, before, self.device), draft.visible(before)
@@ -286,7 +286,8 @@ class Decoder(Follower):
     def commit(self, chunk: Chunk, verified: Verified, accepted: Accepted, proposer: Proposer | None) -> Tensor:
         """Commit the accepted path and, if the chunk has room, the bonus: the target's next token.
 
-        Returns the target's hidden states (1, b + a, E): b of tokens before the draft, a of accepted draft tokens.
+        Returns the hidden states (1, b + a, E) of the b tokens before the draft in this forward, and of the a accepted
+        draft tokens.
         """
         tree, target_tokens, (path, rejected) = verified.tree, verified.target_tokens, accepted
         if proposer is None or not len(tree):
@@ -324,10 +325,10 @@ class Decoder(Follower):
         return torch.cat([hidden[:, :before], hidden[:, before + kept]], 1)
 
     def rectify(self, chunk: Chunk, hidden: Tensor, stopwatch: Stopwatch) -> Tensor:
-        """After a rejection, let the rectifier predict what is missing of the rejected token's control step.
+        """After a rejection, let the rectifier predict the missing values of the rejected token's control step.
 
-        If it filled several values and the chunk is not complete, the target reads their tokens in one more forward,
-        which also gives the next token. Returns `hidden`, followed by the hidden states of that forward.
+        If the target has several unread tokens afterwards and the chunk is not complete, one more forward reads these
+        tokens and gives the next token. Returns `hidden`, followed by the hidden states of that forward.
         """
         last, rectifier = chunk.rounds[-1], self.parts.rectifier
         if rectifier is None or last.accepted == len(last.drafted):
@@ -409,8 +410,8 @@ def greedy(target: Target, prompt: Tensor, cache: Cache | None = None, size: int
         size: N, number of tokens to decode. If 0, the largest number that a chunk of the target can have.
 
     Returns:
-        The decoded tokens (B, N), which after an end token are all end tokens. The hidden states (B, P + N − 1, E) of
-        the prompt and of all decoded tokens but the last.
+        The decoded tokens (B, N): after an end token, all are end tokens. The hidden states (B, P + N − 1, E) of the
+        prompt and of all decoded tokens but the last.
     """
     length, size = prompt.shape[1], size or target.actions.longest(target.chunk)
     cache = cache or target.new_cache(len(prompt), length + size)

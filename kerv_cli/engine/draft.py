@@ -1,4 +1,4 @@
-"""A draft: tokens, possibly still on the GPU, with positions and mask to verify them. Copies to and from a GPU."""
+"""A draft to verify: its tokens, on CPU or GPU, their positions and attention mask. Also copies to and from a GPU."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ HOST = torch.device("cpu")
 
 @dataclass(frozen=True)
 class Draft:
-    """n draft tokens to verify. Those on a GPU are copied together with the target's tokens: the CPU waits once.
+    """n draft tokens to verify.
+
+    Draft tokens on a GPU are copied to the CPU together with the target's tokens. So the CPU waits only once per round.
 
     Attributes:
         tokens: (n,) int64.
@@ -97,7 +99,7 @@ class Draft:
         return None if parents == list(range(ROOT, len(self) - 1)) else ancestors_of(parents)
 
     def positions(self, start: int, before: int, device: torch.device) -> Tensor:
-        """Return the positions (before + n,) of all tokens of a verification, for the target's positional encoding."""
+        """Return the positions (before + n,) of `before` tokens, the first at `start`, and of the draft after them."""
         stop, seen = start + before, self.ancestors
         if seen is None:
             return torch.arange(start, stop + len(self), device=device)
@@ -107,7 +109,10 @@ class Draft:
         return torch.cat([torch.arange(start, stop, device=device), stop + depths])
 
     def visible(self, before: int) -> np.ndarray | Tensor | None:
-        """Return the attention mask of a verification, (before + n, before + n) bool. None if attention is causal."""
+        """Return the attention mask of `before` tokens and the draft after them, (before + n, before + n) bool.
+
+        None if attention is causal.
+        """
         seen, size = self.ancestors, before + len(self)
         if seen is None:
             return None

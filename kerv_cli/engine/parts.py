@@ -39,7 +39,7 @@ class Threshold(Buildable):
     r is the largest accepted distance, in bins, between a draft token and the target's token.
 
     Attributes:
-        measure: How the variability K is computed that `update` gets: one of `MEASURES` (`record.py`).
+        measure: How the variability K, the argument of `update`, is computed: one of `MEASURES` (`record.py`).
     """
 
     measure = "mean of compared"
@@ -55,8 +55,8 @@ class Threshold(Buildable):
         """Learn from a decode that has ended.
 
         Args:
-            variability: The decode's kinematic variability K: the mean difference between draft and target tokens, in
-                normalised action units. None if no draft token was compared.
+            variability: The decode's kinematic variability K: by default the mean difference between draft and target
+                tokens, in normalised action units. None if no draft token was compared.
         """
 
 
@@ -88,7 +88,7 @@ class Rectifier(Buildable):
         """Start a new episode."""
 
     def next_decode(self) -> None:
-        """Count a decode that has ended. Called after every decode, for rectifiers that pause after a prediction."""
+        """Called after every decode. A rectifier that pauses after a prediction counts the paused decodes here."""
 
     @abstractmethod
     def rectify(self, chunk: Chunk) -> Rectified | None:

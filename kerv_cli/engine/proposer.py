@@ -20,8 +20,8 @@ class Proposer(Buildable):
 
     Attributes:
         name: Name in the records, e.g. `drafter`.
-        nodes: Number of draft tokens for which the cache must reserve room, if they can be more than the N tokens of a
-            chunk.
+        nodes: Maximum number of tokens of a draft, for which the target's cache reserves room. It may stay 0 if a
+            draft never has more tokens than a chunk.
     """
 
     name = ""

@@ -22,7 +22,7 @@ Seen = np.ndarray | Tensor | None
 class Cache(Protocol):
     """Keys and values of the tokens that the target has processed, one token per slot.
 
-    Slots 0 … length − 1 of `capacity` are filled. `Target.forward` adds its tokens after them and raises `length`.
+    Slots 0 … length − 1 of `capacity` are filled. `Target.forward` fills the next slots and raises `length`.
     """
 
     length: int
@@ -44,7 +44,7 @@ class Target(Protocol):
 
     Attributes:
         actions: Action space: the DoFs, their limits, and the normalisation that the policy was trained with.
-        chunk: Number of control steps H in a chunk that the policy was trained on.
+        chunk: Number H of control steps in a chunk, as in the policy's training.
         width: Width E of the embeddings and hidden states.
         max_prompt: Largest prompt length P, in tokens, that `encode` can return.
     """
@@ -131,19 +131,21 @@ class PredictsTokens(Protocol):
 
 @runtime_checkable
 class JoinsDrafters(Protocol):
-    """A target that can be compiled together with a drafter, and that can enlarge a small policy's drafter."""
+    """A target that can be compiled together with a drafter, and that can make the drafter larger."""
 
     def join(self, function: Callable[..., Any], *shapes: tuple[int, ...], repeats: bool = False) -> Any:
-        """Compile a function of modules of the target and a compiled drafter. None if the target is not compiled.
+        """Compile a function that calls modules of the target and of a compiled drafter.
+
+        Return the compiled function. None if the target is not compiled.
 
         Args:
-            function: Its inputs are float32 tensors of batch size 1 and of these `shapes`.
+            function: Takes one float32 tensor per entry of `shapes`. The first dimension of each is 1, the batch size.
             repeats: Whether the program can run several times in one call. The outputs of each run are the inputs of
                 the next, to decode or draft several tokens.
         """
 
     def enlarge(self, drafter: nn.Module) -> None:
-        """Enlarge a small policy's drafter in place, if this target was enlarged, too (docs/methods.md §0.2)."""
+        """Enlarge a drafter in place, if this target was enlarged together with its drafters (docs/methods.md §0.2)."""
 
 
 class ReadableTarget(Target, Protocol):
@@ -163,7 +165,7 @@ class ReadableTarget(Target, Protocol):
 
     @property
     def layers(self) -> nn.ModuleList:
-        """The decoder layers, whose matrices every forward reads. `kerv bench` counts them."""
+        """The decoder layers. Every forward reads all their matrices."""
 
     @property
     def dtype(self) -> torch.dtype:

@@ -36,7 +36,7 @@ class Round:
         committed: Number of committed tokens: the accepted draft tokens and the bonus.
         tree_size: Number of draft tokens in the verified tree.
         threshold: Largest accepted distance per DoF, in bins. Empty if no acceptance rule ran.
-        levels: Number of levels that were drafted for a tree, of which fewer may be kept. 0 for a chain.
+        levels: Depth to which a tree was drafted. The verified tree may have fewer levels. 0 for a chain.
     """
 
     mode: str
@@ -84,12 +84,12 @@ class Delay:
 
 @dataclass(frozen=True)
 class Served:
-    """What a policy's server says about one of its answers.
+    """What a policy's server reports about one of its answers.
 
     Attributes:
-        seconds: Its own time for the answer. NaN if it says nothing.
-        drafts: Number of drafts that it verified.
-        accepted: Number of draft tokens that it accepted.
+        seconds: Time that the server needed for the answer. NaN if the server does not report it.
+        drafts: Number of drafts that the server verified.
+        accepted: Number of draft tokens that the server accepted.
     """
 
     seconds: float = math.nan
@@ -162,7 +162,7 @@ def variability(rounds: Sequence[Round], space: ActionSpace, measure: str = MEAN
     """Return the kinematic variability K, in normalised action units: how far drafts were from the target's tokens.
 
     Strict DoFs, such as a gripper, are left out, because one wrong gripper token would outweigh all other differences.
-    None if no draft token counts, or if tokens have no distance.
+    None if no draft token counts, or for FAST tokens, which have no distances.
     """
     if space.code is not None:
         return None

@@ -32,7 +32,7 @@ _LOADED: dict[tuple[Any, ...], Any] = {}  # the key holds everything on which a 
 
 @dataclass(frozen=True)
 class Use:
-    """What a policy's artifacts will be used for. Each artifact checks it before any weights are loaded.
+    """What a policy's artifacts will be used for. `Artifact.check_use` refuses a use before any weights are loaded.
 
     Args:
         method: Settings of the method's parts, by the kind of the part, such as `proposer`.
@@ -45,7 +45,7 @@ class Use:
 
 @dataclass(frozen=True)
 class MadeFor:
-    """What identifies the target that an artifact was made for. If `chunk` is 0, the artifact works with any number."""
+    """The target that an artifact was made for. If `chunk` is 0, the artifact works for chunks of any length."""
 
     sha256: str
     actions: ActionSpace
@@ -57,7 +57,7 @@ class MadeFor:
 
 
 def check_sources(sources: Mapping[str, str], used: Mapping[str, str], what: str, again: str) -> None:
-    """Refuse an artifact that was made from other versions of the policy's target or artifacts (hashes by kind)."""
+    """Refuse an artifact if its `sources` (hashes by kind) differ from the artifacts `used` by the policy."""
     for kind, digest in sources.items():
         if used.get(kind, digest) != digest:
             noun = kind if kind == TARGET else kind_of(kind).noun
@@ -73,7 +73,7 @@ class Artifact(Generic[T]):
     Attributes:
         kind: Name of the kind in settings and paths, such as `drafter`.
         noun: Name of the kind in messages, such as `early drafter`.
-        made: Word that messages use for how such an artifact was made, such as `trained`.
+        made: Verb for making such an artifact, in messages, such as `trained`.
         command: Command-line arguments after `kerv` that make such an artifact. Empty if no command makes it.
     """
 
@@ -93,7 +93,7 @@ class Artifact(Generic[T]):
         return path / f"{self.kind}.json"
 
     def load(self, path: Path, artifacts: Artifacts) -> Any:
-        """Load the artifact in `path`, after `checked`. A subclass returns what a method uses, such as a network."""
+        """Check and load the artifact in `path`. A subclass returns what a method uses, such as a network."""
         return self.checked(path, artifacts.description)
 
     def made_for(self, description: T) -> MadeFor:
@@ -108,7 +108,7 @@ class Artifact(Generic[T]):
         """Refuse a use for which the artifact lacks something. This base class allows every use."""
 
     def is_complete(self, description: T, kinds: Collection[str]) -> bool:
-        """Return whether it has all that a policy with artifacts of these `kinds` needs."""
+        """Return whether the artifact has all that a policy with artifacts of these `kinds` needs."""
         return True
 
     def digest(self, path: Path, description: T) -> str:
@@ -116,7 +116,7 @@ class Artifact(Generic[T]):
         return sha256_of(self.json(path))
 
     def read(self, path: Path) -> T:
-        """Read the description of the artifact in `path`, for whatever target it was made."""
+        """Read the description of the artifact in `path`, whatever target the artifact was made for."""
         file = self.json(path)
         if not file.is_file():
             raise CheckpointError(f"no {self.noun} in {path}: {self.again()}, or name a folder that holds one")
@@ -165,7 +165,7 @@ class Artifacts:
         return kind_of(kind).path(self.results, self.policy.artifacts.get(kind), beside)
 
     def new(self, kind: str) -> Path:
-        """Return the path to which a command writes. Artifacts of shipped policies are refused."""
+        """Return the path to which a command writes an artifact. Paths inside shipped policies are refused."""
         name = self.policy.artifacts.get(kind)
         if name:
             check_name(name, f"policy.artifacts.{kind}:")

@@ -25,7 +25,7 @@ AGAIN = "run 'kerv calibrate replace=true' with the same policy.target= and poli
 
 @dataclass(frozen=True)
 class Demonstrations:
-    """The demonstrations of a calibration. `tasks` is per task `{"training": number of episodes}`."""
+    """The demonstrations that a calibration used. `tasks[name]["training"]` is the number of a task's episodes."""
 
     sha256: str
     tasks: dict[str, dict[str, int]]
@@ -33,11 +33,11 @@ class Demonstrations:
 
 @dataclass(frozen=True)
 class Variability:
-    """Typical variability K of a task (docs/methods.md §3.2).
+    """Typical variability K of a task: how far drafts are from the target's tokens (docs/methods.md §3.2).
 
     Attributes:
         k_s: Reference level K_S: the median K over the measured decodes, normalised action units.
-        levels: Median of K by its name in `MEASURES`. Empty in calibrations before version 1.1.
+        levels: Median of each way to compute K, by its name in `MEASURES`. Empty in calibrations before version 1.1.
     """
 
     k_s: float
@@ -47,7 +47,10 @@ class Variability:
 
 @dataclass(frozen=True)
 class BoundarySection:
-    """Ranges by which HeiSD's boundary scales its path (§4.4), by the number of hand positions as text, as `15`."""
+    """Ranges of curvature and path length for HeiSD's boundary (docs/methods.md §4.4).
+
+    The keys of `windows` are numbers of hand positions as text, such as `15`.
+    """
 
     episodes: int
     windows: dict[str, BoundaryRanges]
@@ -57,14 +60,14 @@ class BoundarySection:
 class SkipLevel:
     """The similarity (cosine) s_min at which verification of a task is skipped (docs/methods.md §4.3).
 
-    A match is a datastore entry and the most similar entry of another episode. A skip rule may move s_min from `low` to
-    `high`.
+    A match is a datastore entry and the most similar entry of another episode. A skip rule may move s_min between `low`
+    and `high`.
 
     Attributes:
-        share: Share of the matches that are at least so similar.
-        entries: Number of matches.
-        within: Share of good ones among these. None if there are none.
-        error: Their mean absolute difference, normalised action units. None if there are none.
+        share: Share of the matches with a similarity of s_min or more.
+        entries: Number of all matches.
+        within: Share of good matches among those from s_min on. None if there are none.
+        error: Mean absolute difference of the chunks in the matches from s_min on, normalised action units, or None.
     """
 
     s_min: float
@@ -82,7 +85,7 @@ class SkipSection:
 
     Attributes:
         datastore: Hash of the datastore.
-        epsilon: A match is good up to this mean absolute difference of the chunks, normalised action units.
+        epsilon: Largest mean absolute difference of the two chunks of a good match, normalised action units.
         confidence: Minimum share of good matches from s_min on.
     """
 
@@ -96,7 +99,7 @@ class SkipSection:
 class Calibration:
     """Contents of `calibration.json` (docs/formats.md). A section that was not measured is None or empty.
 
-    `window` is the number of past actions that a predictor reads. `noise` is by the filter's name, `kalman`.
+    `window` is the number of past actions that a predictor reads. The key of `noise` is `kalman`, the filter's name.
     """
 
     target: MadeFor
@@ -158,7 +161,7 @@ class Calibration:
 
 
 class CalibrationArtifact(Artifact[Calibration]):
-    """Finds, checks and loads calibrations. Every `path` is the path of the single file."""
+    """Finds, checks and loads calibrations. Here `path` always means the JSON file, not a folder."""
 
     kind = noun = "calibration"
     made, command = "made", ("calibrate",)

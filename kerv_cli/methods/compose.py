@@ -104,7 +104,7 @@ class Method:
             raise UsageError(f"rollout.batch={batch}: threshold={threshold.name} follows one episode. Use another")
 
     def decoder(self, target: Target, artifact: Callable[[str], Any], task: str = "") -> Decoder:
-        """Build the decoder. `artifact` returns the loaded artifact of a kind, for the kinds in `needs` alone."""
+        """Build the decoder. `artifact` loads the artifact of a kind, and is called only for the kinds in `needs`."""
         from kerv_cli.engine.decoder import Decoder, Parts
 
         self.check(target)

@@ -13,7 +13,7 @@ class Context:
 
     Attributes:
         target: A `Target`. Some parts need a `ReadableTarget` (`engine/protocol.py`).
-        artifact: Returns the loaded artifact of a kind, such as `drafter`.
+        artifact: Function that returns the loaded artifact of a kind, such as `drafter`.
         task: Full name of the task. Empty if unknown.
         built: The method's parts that are built already, by kind such as `proposer`.
         method: Settings of all parts of the method, by kind.

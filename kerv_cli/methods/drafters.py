@@ -1,4 +1,4 @@
-"""Base class of drafters with weights: a subclass trains, saves, loads and proposes (docs/extending.md)."""
+"""Base class of drafters with weights: training examples, loss, files and proposer (docs/extending.md)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class DrafterDescription(checkpoint.Description):
 
 @dataclass(frozen=True)
 class Decodes(Rows):
-    """Training examples of a drafter: the tokens that the target decodes greedily from n observations, by episode.
+    """Training examples of a drafter: the tokens that the target decodes greedily from n observations.
 
     Each kind of drafter has a subclass that adds the inputs of its network.
 

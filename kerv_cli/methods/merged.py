@@ -53,9 +53,10 @@ def needs_of_sources(settings: MergedProposerSettings) -> tuple[str, ...]:
     "merged", MergedProposerSettings, needs=needs_of_sources, colour=0xCC79A7, when=PREFILL, merged=True, cost="early"
 )
 class MergedProposer(ChainProposer):
-    """Merges the drafts of several proposers into one prefix tree. If it has more than `nodes`, the last drafts go.
+    """Merges the drafts of several proposers into one prefix tree of at most `nodes` nodes.
 
-    Those in `fallback` draft only if no source expects its whole chunk to be accepted.
+    If the tree would be larger, the last drafts are left out. Proposers in `fallback` draft only if no source expects
+    its whole chunk to be accepted.
     """
 
     def __init__(self, sources: Sequence[ChainProposer], nodes: int, fallback: Sequence[ChainProposer] = ()) -> None:

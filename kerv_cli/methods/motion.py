@@ -41,10 +41,10 @@ class MotionAcceptanceSettings:
 class MotionRule(DistanceRule):
     """Accepts a draft token if the chunk's motion is nearly the same as with the target's token.
 
-    Each of the two motions is decoded from the committed tokens, the accepted draft tokens, and one of the two tokens.
-    Coefficients that are still missing count as zero. No action of the chunk may differ by more than `tolerance`. The
-    draft token may not decide more coefficients than the target's token. It may end the chunk only if the target's
-    token does so, too.
+    FAST tokens stand for frequency coefficients of the chunk's motion. After the tokens accepted so far, either the
+    draft token or the target's token follows, and all missing coefficients count as zero. No action of these two
+    motions may differ by more than `tolerance`. The draft token may not give more coefficients than the target's token,
+    and may end the chunk only if the target's token ends it.
     """
 
     tolerance: float
@@ -71,10 +71,7 @@ class MotionRule(DistanceRule):
         return (0,)
 
     def difference(self, before: Sequence[int], token: int, other: int) -> float:
-        """Return the largest difference between the normalised actions of two motions.
-
-        They are decoded from the tokens `before`, followed by `token` and by `other`.
-        """
+        """Return the largest change of a normalised action if `other`, not `token`, follows the tokens `before`."""
         import numpy as np
 
         start = len(self.code.decode(before))

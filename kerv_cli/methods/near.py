@@ -15,19 +15,19 @@ if TYPE_CHECKING:
     from kerv_cli.engine.chunk import Chunk
     from kerv_cli.engine.draft import Draft
 
-DECAY = 0.8  # an error counts so much less with every later action
+DECAY = 0.8  # factor by which the weight of an error falls with every later action
 CAP, FLOOR, FIRST = (
     4.0,
     0.1,
     0.5,
 )  # bins: largest error that counts, smallest scale; weight of the scale 1 to begin with
-SHARE = 0.1  # of the weight, which both guesses divide however wrong they were
+SHARE = 0.1  # share of the trust that is split equally between both guesses, however wrong they were
 WIDTH = 16  # tokens that are considered at each place
 
 
 @dataclass
 class NearProposerSettings:
-    """The most probable tokens around the last action and around a line through the last two (§5.2)."""
+    """Draft the most probable tokens around the last action and around a line through the last two (§5.2, ours)."""
 
     kind: str = "near"
     nodes: int = number(48, 1, MOST_TOKENS)  # size of the tree
@@ -35,7 +35,10 @@ class NearProposerSettings:
 
 @ProposerPart("near", NearProposerSettings, colour=0x1B7837, when=PREFILL)
 class NearProposer(Proposer):
-    """Drafts a tree around two guesses, *hold* and *line*, wider where the last actions were hard to guess."""
+    """Drafts a tree around two guesses: *hold* repeats the last action, *line* continues the last two.
+
+    The tree is wider where the guesses were wrong for the last actions.
+    """
 
     name = "near"
 
@@ -68,10 +71,10 @@ class NearProposer(Proposer):
 
 
 def expected(past: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Guess the next actions from the past ones (m, D), in bins.
+    """Guess the next actions from the past actions (m, D). Actions and errors are in bins.
 
-    Returns the guesses (2, steps, D) *hold* and *line*, the sizes of their errors so far (2, steps, D), in bins, and
-    how much each guess is trusted (2,), which sums to 1.
+    Returns the guesses *hold* and *line* (2, steps, D), the mean errors of such guesses so far (2, steps, D), and the
+    trust in each guess (2,), which sums to 1.
     """
     import numpy as np
 
@@ -98,9 +101,9 @@ def expected(past: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def probabilities(guesses: np.ndarray, scales: np.ndarray, vocabulary: int) -> np.ndarray:
-    """Return how probable each token is under each guess, (2, N, V).
+    """Return the probability (2, N, V) of each token under each guess.
 
-    A two-sided geometric distribution around the guess (2, N), whose mean error grows with the scale (2, N), in bins.
+    The distribution around a guess (2, N) is two-sided geometric. Its mean error grows with the scale (2, N), in bins.
     """
     import numpy as np
 
@@ -111,11 +114,11 @@ def probabilities(guesses: np.ndarray, scales: np.ndarray, vocabulary: int) -> n
 
 
 def likely_tree(table: np.ndarray, weights: np.ndarray, nodes: int) -> tuple[list[int], list[int]]:
-    """Return tokens and parents of the most probable prefixes, level by level.
+    """Return the tokens and the parents (−1 for the root) of the draft tree's `nodes` most probable nodes.
 
     Args:
         table: Probability of each token under each guess, (2, places, V).
-        weights: How much each guess is trusted, (2,). Along a path the guess that gives its tokens gains.
+        weights: Trust in each guess, (2,). Along a path, trust shifts to the guess that made its tokens more probable.
     """
     import numpy as np
 

@@ -85,7 +85,7 @@ class LookupProposer(ChainProposer):
 
 @ProposerPart("last_action", NoSettings, colour=0x2CA25F, when=PREFILL, chains=True, any_code=True)
 class LastActionProposer(ChainProposer):
-    """Drafts the steps of the last chunk that are still to come, then its last action again and again (ours, §5.2).
+    """Drafts the actions of the last chunk that are not executed yet, then repeats the last one of them (ours, §5.2).
 
     FAST tokens encode whole chunks, so these actions are encoded together.
     """

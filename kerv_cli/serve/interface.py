@@ -46,7 +46,7 @@ class Interface:
         self.grip = self.spec.grip if self.spec else ()
 
     def image(self, image: object, camera: str, key: str) -> np.ndarray:
-        """Check an image (height, width, 3) uint8 that a client sent. It may be a function that returns it."""
+        """Check a client's image (height, width, 3) uint8, and return it. `image` may be a function that returns it."""
         shape = frame_shape(camera, self.size)
         image = image() if callable(image) else image
         if isinstance(image, np.ndarray):
@@ -82,7 +82,7 @@ class Interface:
         return numbers[:few], np.concatenate([numbers, np.zeros(many - len(numbers))])
 
     def converted(self, actions: np.ndarray) -> np.ndarray:
-        """Return actions (H, D) in environment units, the gripper's values in the client's convention, as float64."""
+        """Return actions (H, D) float64 in environment units, but the gripper in the client's convention."""
         values, strict = actions.astype(np.float64), self.actions.is_strict
         if self.gripper in OPEN:
             values[:, strict] = np.where(values[:, strict] > 0.5, OPEN[self.gripper], -OPEN[self.gripper])
@@ -94,7 +94,7 @@ def keys_of(message: Message) -> str:
 
 
 def text_of(value: object, key: str) -> str:
-    """Return the instruction that a client sent under `key`. A missing or empty one is refused."""
+    """Return the instruction that a client sent under `key`. A missing or empty instruction is refused."""
     if not isinstance(value, str | None):
         raise UsageError(f"{key} is {type(value).__name__}, a text is wanted")
     if not value or not value.strip():

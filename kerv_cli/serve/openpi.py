@@ -1,7 +1,7 @@
 """Speak openpi's protocol, which is meant for robots.
 
 After the handshake the server sends its metadata. Then the client sends observations as binary websocket messages. The
-server answers each with a chunk of actions, or with a text message that says what is wrong with the observation.
+server answers an observation with a chunk of actions, or with a text message that says what is wrong with it.
 """
 
 from __future__ import annotations

@@ -47,9 +47,9 @@ class Policy:
         chunk: H, number of control steps in an answer.
         by_task: Whether a decoder depends on the task. This is so if the method's calibrated values or drafts depend on
             the task. Then clients must name the task.
-        low: (p,) lower ends of the ranges in which the policy may act, one per number of the state: the range of the
-            demonstrations plus a margin. (s,) if the policy reads the whole simulator state. Empty if the checkpoint
-            stores no range, or if the policy reads no state.
+        low: Lower ends of the ranges in which the policy may act: the demonstrations' ranges plus a margin. One per
+            number of the proprioception, or of the state if the policy reads the whole state. Empty if the checkpoint
+            stores no ranges, or if the policy reads no state.
         high: Upper ends of these ranges, of the same shape.
     """
 

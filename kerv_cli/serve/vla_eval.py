@@ -81,7 +81,6 @@ class VlaEval(Conversation):
         self.sequence = 0
 
     def answer(self, frame: bytes | str) -> bytes | None:
-        """Return the answer to a message, or None if it needs no answer."""
         message = unpacked(frame)
         kind, payload, sequence = str(message.get("type")), message.get("payload"), message.get("seq")
         self.sequence = sequence if isinstance(sequence, int) else 0

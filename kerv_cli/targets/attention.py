@@ -48,7 +48,7 @@ class Cache:
         self._copies: tuple[np.ndarray, np.ndarray] | None = None
 
     def copies(self, width: int) -> tuple[np.ndarray, np.ndarray, int]:
-        """Return the memory in which compiled programs keep copies of keys and values, in panels.
+        """Return the memory in which compiled programs keep copies of keys and values, in panels of `width` numbers.
 
         Returns:
             The keys (layers, B · A, panels, C, width), the values (layers, B · A, panels, slots, width), and how many
@@ -63,7 +63,7 @@ class Cache:
         return *self._copies, min(self.copied, self.length)
 
     def compact(self, start: int, slots: Tensor) -> None:
-        """Keep the tokens of an accepted path, and drop the rest of the draft tree. They move to `start`, start + 1, ….
+        """Move the tokens of an accepted path to the slots start, start + 1, …, and drop the rest of the draft tree.
 
         Args:
             slots: (n,) slots of the kept tokens in increasing order, none before `start`.
@@ -155,8 +155,8 @@ class CapturedCache(Cache):
 
     A graph takes a fixed number of tokens, its size. A forward of T tokens runs in the smallest graph that is large
     enough. The unused tokens have zeros as input. Their keys and values go to the spare slot, which no other token
-    attends to. A forward of more than 64 tokens, such as a long prompt, runs without a graph: to capture one in an
-    episode would count in its time. The batch size is 1. On a CPU the same computation runs without graphs, for tests.
+    attends to. A forward of more than 64 tokens, such as a long prompt, runs without a graph, because capturing one
+    would add to the episode's time. The batch size is 1. On a CPU the same computation runs without graphs, for tests.
 
     Attributes:
         steps: The graphs, by number of tokens. Empty before the first forward of at most 64 tokens.

@@ -87,7 +87,7 @@ class TargetDescription(Description):
         return self.provenance.get("settings", {}).get("demos") or ""
 
     def check_world(self, name: str, environment: str, actions: ActionSpace, size: int) -> None:
-        """Refuse an environment in which the target cannot act. Its images have `size` pixels per side."""
+        """Refuse an environment in which the target cannot act. `size`: pixels per side of the environment's images."""
         trained = self.settings.get("image_size", size)
         if self.cameras and size != trained:
             raise UsageError(f"world.camera.size={size}: the policy was trained on {trained} pixels")

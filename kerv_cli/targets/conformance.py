@@ -32,9 +32,9 @@ Pairs = Iterable[tuple[Tensor, Tensor]]
 
 @torch.inference_mode()
 def check_target(target: Target, observation: Observation) -> list[Finding]:
-    """Return one finding per check.
+    """Return one finding per check. If a check fails that all later checks need, the later checks are left out.
 
-    A failed check that all later ones need is the last. The observation's values do not matter.
+    The observation's values do not matter.
     """
     trial, findings = Trial(target, observation), []
     for what, fault, check in CHECKS:
@@ -141,8 +141,8 @@ class Trial:
     def draft_tree(self) -> Pairs:
         """Compare each node's hidden state in the tree with a forward of only the node's path.
 
-        The tree first follows cached tokens, as in a later round of a decode, then the prompt in one forward, as in a
-        prefill that verifies a draft.
+        The tree is checked twice: after cached tokens, as in a later round of a decode, and in one forward with the
+        prompt, as in a prefill that verifies a draft.
         """
         after = self.forward_tree()[1][:, 1:]
         positions, cache = TREE.positions(0, self.length, self.prompt.device), self.new_cache()

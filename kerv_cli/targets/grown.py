@@ -1,10 +1,10 @@
 """A grown target: a trained policy whose trunk is enlarged, so that it costs more but gives the same tokens.
 
-It shows how a method behaves at the speed of a larger model (docs/methods.md §0.2). Only the layers grow. They get
-additional channels that stay zero, additional heads and hidden units whose output weights are zero, and additional
+It shows how a method behaves at the speed of a larger model (docs/methods.md §0.2). Only the trunk's layers grow: they
+get additional channels that stay zero, additional heads and hidden units whose output weights are zero, and further
 layers that add nothing. A longer prompt consists of masked tokens, which a prefill computes and drops. The outputs are
-equal except for rounding, but every weight is read and multiplied. The folder of a grown target contains a recipe. The
-weights are made when the target is loaded.
+equal except for rounding, but every weight is read and multiplied. The folder of a grown target contains only a recipe.
+The weights are made when the target is loaded.
 """
 
 from __future__ import annotations
@@ -44,10 +44,7 @@ class Recipe(GrowSettings):
 
 
 def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
-    """Replace the layers of a trunk or a drafter by more and larger ones, in place.
-
-    It still computes the same function.
-    """
+    """Replace the layers of a trunk or a drafter by more and larger layers, in place. The outputs stay the same."""
     old: list[Any] = [copy.deepcopy(layer).float() for layer in stack.layers]
     stack.compiled = None
     units, channels = old[0].down.in_features, stack.width // stack.heads
@@ -111,7 +108,7 @@ def check_weights(folder: Path, description: TargetDescription) -> None:
 
 
 def build(folder: Path, description: TargetDescription, device: str, dtype: torch.dtype) -> CompactTarget:
-    """Load the policy that the recipe in a grown target's description names, and enlarge its trunk."""
+    """Load the original policy, which the recipe of a grown target names, and enlarge its trunk."""
     recipe = recipe_of(description)
     base = Path(recipe.base)
     target = build_compact(base, checkpoint.read_target(base), device, dtype)

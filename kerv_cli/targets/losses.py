@@ -43,7 +43,7 @@ def token_loss(logits: Tensor, tokens: Tensor, labels: Tensor, counted: Tensor |
 
 
 def within_chunk(tokens: Tensor, end: int | None) -> Tensor:
-    """Return whether each of the tokens (B, N) belongs to its chunk. The token `end` does, those after it do not."""
+    """Return which tokens belong to their chunks, (B, N) bool: all up to and including the first `end`."""
     ends = tokens == (-1 if end is None else end)
     return ends.cumsum(1) - ends.long() == 0
 

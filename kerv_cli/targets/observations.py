@@ -29,9 +29,9 @@ BATCH = 64  # observations that a target encodes and decodes at once
 
 @dataclass(frozen=True)
 class Rows:
-    """Base class of dataclasses whose fields (tensors, encoded images) have one row per sample.
+    """Base class of dataclasses of samples. Each field (a tensor, or encoded images) has one row per sample.
 
-    Without images, their field is None.
+    A field for images is None if the samples have no images.
     """
 
     def __len__(self) -> int:
@@ -86,8 +86,7 @@ def read_observations(
     """Return the observations of an episode, to train a compact policy.
 
     Args:
-        chosen: Which observations to return. If the policy reads images, they are the control steps with an image, else
-            all.
+        chosen: Which of the control steps to return, or, if the policy reads images, which of those with an image.
     """
     sees, frames = settings.observation == "vision", None
     steps = observed_steps(episode, sees)[chosen]
@@ -105,7 +104,8 @@ def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarr
     """Return the expert's next H actions (n, H, D) at n control steps, in environment units without noise.
 
     Args:
-        steps: (n,) control steps at which the chunks begin. Near the end, chunks include the actions recorded after it.
+        steps: (n,) control steps at which the chunks begin. Chunks near the episode's end include the actions
+            that were recorded after the end.
         chunk: H, control steps per chunk.
     """
     check_tail(episode, chunk, f"chunks of {chunk}")
@@ -119,9 +119,9 @@ def observed_steps(episode: DemoEpisode, sees: bool) -> np.ndarray:
 def observations_of(
     target: Target, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace
 ) -> list[Observation]:
-    """Return what a target would have observed at the control steps (n,) of a demonstration.
+    """Return the observations that a target would have got at the control steps (n,) of a demonstration.
 
-    Each of its cameras gets the recorded image.
+    Each of the target's cameras gets the recorded image.
     """
     frames: Any = [None] * len(steps)
     if target.cameras:
@@ -150,7 +150,7 @@ def prompts_of(target: Target, observations: Iterable[Observation], size: int = 
 
 
 def check_tail(episode: DemoEpisode, steps: int, use: str) -> None:
-    """Check that `steps` expert actions were recorded from the last control step on. `use` says what needs them."""
+    """Check that an episode has `steps` expert actions from its last control step on. `use`: for the message."""
     tail = len(episode.labels) - episode.steps
     if tail < steps - 1:
         raise CheckpointError(

@@ -17,13 +17,13 @@ _HERE = Path(__file__).resolve().parent
 
 
 def provenance_of(command: str, settings: Any, device: str, **figures: Any) -> dict[str, Any]:
-    """Return the whole provenance of an artifact: command, settings, figures, versions, commit and device."""
+    """Return the provenance of an artifact: command, settings, figures, versions, commit and device."""
     made = {"versions": versions(), "git_commit": git_commit(), "device": device, "device_name": device_name(device)}
     return {"command": command, "settings": asdict(settings), **figures, **made}
 
 
 def stamp(device: str) -> dict[str, str]:
-    """Return host, device, versions and commit, by the columns of the table of episodes."""
+    """Return host, device, versions and commit. The keys are columns of the table of episodes."""
     numbers = {f"{name}_version": number for name, number in versions().items()}
     return {"host": socket.gethostname(), "device_name": device_name(device), **numbers, "git_commit": git_commit()}
 

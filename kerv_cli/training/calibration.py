@@ -1,8 +1,9 @@
 """`kerv calibrate`: measure numbers that KERV and HeiSD need, and write a JSON file (docs/methods.md §3, §4).
 
-They are measured on demonstrations: the noise of the kinematic predictors; each task's K_S, the reference level of the
-kinematic variability K (how far drafts are from the target's tokens); the ranges of curvature and path length at the
-boundary; each task's smallest similarity at which a retrieved chunk is executed without verification.
+The numbers are measured on demonstrations: the noise of the kinematic predictors; each task's K_S, the reference level
+of the kinematic variability K (how far drafts are from the target's tokens); the ranges of curvature and path length,
+by which the boundary chooses who drafts; each task's smallest similarity at which a retrieved chunk is executed without
+verification.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ Calibrated = tuple[Path, stored.Calibration, list[str]]  # its file, and a line 
 
 @dataclass(frozen=True)
 class CalibrationWork:
-    """A calibration whose settings are checked."""
+    """Measures a calibration and writes its JSON file, after `plan_calibration` has checked the settings."""
 
     settings: CalibrateSettings
     artifacts: Artifacts
@@ -72,7 +73,6 @@ class CalibrationWork:
     path: Path
 
     def __call__(self, stage: Stage) -> Calibrated:
-        """Measure the sections, and write them to one JSON file."""
         settings, dataset, target = self.settings, self.dataset, self.artifacts.description
         with stage("reading demonstrations") as progress:
             past, future, paths, counts = read_windows(
@@ -100,7 +100,7 @@ class CalibrationWork:
         return self.path, calibration, notes
 
     def seconds(self) -> float:
-        """Measure what a few demonstrations take, with two decodes if there is a drafter. Estimate the time of all."""
+        """Estimate the seconds of a calibration from a few demonstrations and, with a drafter, from two decodes."""
         settings, chosen, target = self.settings, self.chosen[:FEW], self.artifacts.description
         clock = Stopwatch(torch.device(self.artifacts.device))
         _, _, paths, _ = read_windows(self.dataset, chosen, target.actions, settings.window, target.chunk, _silent)
@@ -135,10 +135,10 @@ def _silent(done: int, total: int) -> None:
 
 
 def plan_calibration(settings: CalibrateSettings, database: Database) -> Plan[Calibrated]:
-    """Check what a calibration is measured on. The work measures its sections and writes them to one JSON file.
+    """Check the settings and the artifacts of a calibration, and return the plan to measure it.
 
-    It returns the file's path, the calibration, and a line per section that was not measured: no K_S if `decodes` is 0
-    or the drafter is missing, no skip levels without a datastore.
+    `Plan.make` returns the file's path, the calibration, and a line per section that was not measured: no K_S if
+    `decodes` is 0 or the drafter is missing, no skip levels without a datastore.
     """
     device, _ = set_up(settings.runtime)
     artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
@@ -192,7 +192,7 @@ def presample(
 def reference_level(records: Sequence[DecodeRecord], actions: ActionSpace, chunk: int) -> stored.Variability:
     """Return a task's reference level K_S: the median of the variability K over the decodes, for each measure of K.
 
-    Decoding divides by K_S. So it is at least the K of a chunk in which a single token is off by one bin.
+    Thresholds divide by K_S. So K_S is at least the K of a chunk in which a single token is off by one bin.
     """
     bin_width, moving = 2.0 / actions.tokens, chunk * int((~actions.is_strict).sum())
     levels = {}
@@ -255,7 +255,7 @@ def read_windows(
 
     Returns:
         - (n, window, D) normalised actions before each moment
-        - (n, H, D) normalised actions from it on
+        - (n, H, D) normalised actions from each moment on
         - (T, 3) metres, the end effector's positions in each episode
         - the number of episodes of each task, as in `Demonstrations`
     """
@@ -329,7 +329,10 @@ def match(store: Datastore, task: str, epsilon: float) -> Matches:
 
 
 def lowest_level(matches: Matches, confidence: float, least: int = LEAST) -> float | None:
-    """Find the lowest similarity s for which enough of the matches with a similarity of s or more are good."""
+    """Return the lowest similarity s for which at least the share `confidence` of the matches from s on is good.
+
+    None if there is no s with at least `least` matches from s on.
+    """
     order = np.argsort(-matches.similarity, kind="stable")
     ranked = matches.similarity[order]
     above = np.arange(1, len(ranked) + 1)

@@ -38,7 +38,7 @@ BATCH = 128  # maximum number of observations that are encoded together
 
 @dataclass(frozen=True)
 class DatastoreWork:
-    """A datastore whose settings are checked."""
+    """Builds a datastore, after `plan_datastore` has checked the settings."""
 
     settings: BuildDatastoreSettings
     artifacts: Artifacts
@@ -50,7 +50,6 @@ class DatastoreWork:
         return [self.dataset.episodes[index].seed for index in self.chosen[task]]
 
     def __call__(self, stage: Stage) -> tuple[Path, stored.Datastore]:
-        """Encode the demonstrations, and write the datastore."""
         parts: list[dict[str, np.ndarray]] = []
         shards: dict[str, stored.Shard] = {}
         rows, number = 0, sum(map(len, self.chosen.values()))
@@ -67,7 +66,7 @@ class DatastoreWork:
         return self.folder, stored.Datastore.open(self.folder, self.artifacts.description)
 
     def seconds(self) -> float:
-        """Encode one demonstration, and estimate the time of all."""
+        """Estimate the seconds that all demonstrations take, from one of them."""
         first = next(iter(self.chosen.values()))[0]
         episode, space, times = self.dataset.load(first), self.dataset.manifest.observation, list[float]()
         for _ in range(2):  # the first time includes loading and compiling
@@ -104,7 +103,10 @@ class DatastoreWork:
 
 
 def plan_datastore(settings: BuildDatastoreSettings, database: Database) -> Plan[tuple[Path, stored.Datastore]]:
-    """Check the demonstrations of a datastore. The work writes it, and returns its folder and the opened datastore."""
+    """Check the settings of a datastore, and return the plan to build it from demonstrations.
+
+    `Plan.make` returns the folder and the opened datastore.
+    """
     if not settings.key:
         raise UsageError("key=[]: name at least one part of the prompt: scene, vision, proprioception")
     device, _ = set_up(settings.runtime)

@@ -84,7 +84,11 @@ def _remedy(parent: Path, folder: Path, tasks: Sequence[str], episodes: int) -> 
 
 
 def demos_for(settings: S, target: TargetDescription, database: Database) -> tuple[S, DemoDataset]:
-    """Open the demonstrations named in the settings, or by default the ones that the target was trained on."""
+    """Open the demonstrations named in the settings, or by default those that the target was trained on.
+
+    The returned settings name the demonstrations. Tasks that the target was not trained on are left out, unless `task`
+    names tasks.
+    """
     name, tasks = settings.demos or target.demos or name_of(()), settings.task
     if settings.demos:
         dataset = open_demos(database, name, tasks or target.tasks)
@@ -143,7 +147,7 @@ def seen_by(dataset: DemoDataset, camera: str, who: str, remedy: str) -> DemoDat
 class PolicyActor:
     """Chooses the actions that a recording executes: for each chunk, either the policy's or the expert's.
 
-    Task and seed determine in which. The decoder is never told whether an episode succeeded, so no episode depends on
+    Task and seed determine the choice. The decoder is never told whether an episode succeeded, so no episode depends on
     earlier ones.
     """
 
@@ -175,7 +179,7 @@ class PolicyActor:
 
 @dataclass(frozen=True)
 class PolicyActs:
-    """Makes the `PolicyActor` of a recording, in the process that records. It holds no weights.
+    """Makes the `PolicyActor` of a recording, in the process that records. `PolicyActs` itself holds no weights.
 
     Attributes:
         sha256: Hash of the method and all its weights.

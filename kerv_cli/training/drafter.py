@@ -29,7 +29,7 @@ SAMPLES = 64  # decodes of which `--plan` measures the time
 
 @dataclass(frozen=True)
 class DrafterTraining(fit.Training):
-    """A training of a drafter whose settings are checked."""
+    """The training of a drafter, after `plan_drafter` has checked the settings."""
 
     drafter: TrainableDrafter
     artifacts: Artifacts
@@ -50,7 +50,7 @@ class DrafterTraining(fit.Training):
         return network, loss, validate, write
 
     def seconds(self) -> float:
-        """Measure a few decodes and steps on a few demonstrations, and estimate the time of all."""
+        """Estimate the seconds of all decodes and steps, from a few of each."""
         drafter, dataset, held_out = self.drafter, self.dataset, self.settings.train.held_out
         few, target, own = replace(dataset, episodes=dataset.episodes[: fit.FEW]), self.target(), self.settings.drafter
         stride = int(dataset.manifest.config["frame_stride"]) if target.cameras else 1  # control steps per observation
@@ -81,9 +81,10 @@ class DrafterTraining(fit.Training):
 
 
 def plan_drafter(settings: TrainDrafterSettings, database: Database) -> Plan[tuple[Path, fit.Metrics]]:
-    """Plan the training of a drafter. The plan, when executed, returns its folder and the best weights' metrics.
+    """Check the settings of a training, and return the plan to train a drafter or to go on with its training.
 
-    The target decodes in `runtime.dtype`. The drafter is trained in float32. An interrupted training goes on.
+    The target decodes in `runtime.dtype`. The drafter is trained in float32. `Plan.make` returns the drafter's folder
+    and the metrics of the best weights.
     """
     drafter: TrainableDrafter = find("drafter", settings.drafter.kind, "drafter.kind").built()
     artifacts, train = Artifacts(settings.results, settings.policy), settings.train

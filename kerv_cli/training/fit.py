@@ -61,7 +61,10 @@ def fit(
     identity: str,
     progress: Progress = lambda done, total, text: None,
 ) -> Metrics:
-    """Train a network for `settings.steps` steps in all. If the folder holds a resume file, continue from there."""
+    """Train a network for `settings.steps` steps in all, and return the metrics with the best score.
+
+    If the folder holds a resume file, training continues from there.
+    """
     network.train()
     state = State(network, settings, folder, identity)
     state.restore()
@@ -170,7 +173,7 @@ def check_finite(metrics: Metrics, step: int) -> None:
 
 
 def batches(count: int, settings: TrainSettings, weights: Tensor | None = None) -> Callable[[int], Tensor]:
-    """Return a function: step -> indices (B,) int64 of its samples. Only `settings.seed` and the step determine them.
+    """Return a function that draws the samples of a step: their indices (B,) int64, fixed by `settings.seed` and step.
 
     Args:
         weights: (count,) float64. Sample i is drawn in proportion to `weights[i]`. If None, all are equally likely.
@@ -251,7 +254,7 @@ def identity_of(train: TrainSettings, dataset: DemoDataset, **own: Any) -> str:
 
 @dataclass(frozen=True)
 class Destination:
-    """Where a training is made: in its own folder, or in a temporary one that replaces older weights on completion."""
+    """Where a training writes: in its own folder, or in a temporary one that replaces older weights on completion."""
 
     folder: Path
     identity: str
@@ -273,7 +276,7 @@ class Destination:
 
     @contextmanager
     def opened(self) -> Iterator[Path]:
-        """Yield the folder to train in. A temporary one replaces `self.folder` when the `with` block ends."""
+        """Yield the folder to train in. If it is temporary, it replaces `self.folder` when the `with` block ends."""
         new = unfinished(self.folder)
         in_place = not visible(self.folder) or (self.begun and self._resumes(self.folder))
         if not self.replace or (in_place and not new.exists()):
@@ -292,7 +295,7 @@ class Destination:
 
     @staticmethod
     def _stored(folder: Path) -> tuple[str, int] | None:
-        """Return identity and step in a folder's resume file. None without one; ("", 0) if it cannot be read."""
+        """Return identity and step in a folder's resume file, None if there is no file, ("", 0) if it is damaged."""
         try:
             state = torch.load(folder / RESUME, "cpu", mmap=True, weights_only=True)
             return state["identity"], state["step"]
@@ -336,7 +339,7 @@ Ready = tuple[nn.Module, Loss, Validate, Write]
 
 @dataclass(frozen=True)
 class Training(ABC):
-    """A training whose settings are checked. A subclass makes the network and its samples."""
+    """Base class of trainings, after their settings were checked. A subclass makes the network and the samples."""
 
     settings: Any
     dataset: DemoDataset
@@ -350,7 +353,7 @@ class Training(ABC):
 
     @abstractmethod
     def seconds(self) -> float:
-        """Estimate the time of all steps from a few of them."""
+        """Estimate the seconds of the whole training, from a few steps."""
 
     def plan(self, kind: str, text: str) -> Plan[tuple[Path, Metrics]]:
         self.place.check()

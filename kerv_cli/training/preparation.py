@@ -29,7 +29,7 @@ class Step:
     Attributes:
         kind: Kind of the artifact, such as `drafter` or `datastore`.
         state: `there`, `missing`, `unfinished`, `incomplete` (a calibration without some numbers), `of other artifacts`
-            (it was made from artifacts that have been replaced since) or, while it trains, `step 300 of 4000`.
+            (made from artifacts that have been replaced since) or, while a drafter trains, `step 300 of 4000`.
         command: Command-line arguments after `kerv` that make the artifact, without the arguments that all steps share.
     """
 

@@ -1,4 +1,4 @@
-"""Settings of the commands that record demonstrations, train, build or calibrate, and how their work begins."""
+"""Settings of the commands that record demonstrations, train, build or calibrate, and the `Plan` of a command."""
 
 from __future__ import annotations
 
@@ -34,15 +34,16 @@ def quietly(title: str) -> AbstractContextManager[Callable[..., None]]:
 
 @dataclass(frozen=True)
 class Plan(Generic[T]):
-    """Work on an artifact whose settings are checked. Nothing is made until `make` is called.
+    """A plan to make an artifact, with settings that were checked. Nothing is made until `make` is called.
 
     Attributes:
         kind: Kind of the artifact.
-        path: Its folder; for a calibration its file.
+        path: Folder of the artifact, or the file of a calibration.
         text: What would be made, for `--plan`.
         work: Function that makes the artifact, and shows its stages.
-        check: Called again before the work. It refuses to replace what is there.
-        seconds: Estimates how long the work takes, for `--plan`, from what `source` says. None if unknown.
+        check: Function that refuses to replace existing files. `make` calls it again before `work`.
+        seconds: Function that estimates the seconds of `work`, for `--plan`. None if they cannot be estimated.
+        source: What the estimate is based on, or why there is none.
     """
 
     kind: str

@@ -55,7 +55,7 @@ VALIDATED = 2048  # maximum number of samples in a validation
 
 @dataclass(frozen=True)
 class TargetTraining(fit.Training):
-    """A training of a compact policy whose settings are checked."""
+    """The training of a compact policy, after `plan_target` has checked the settings."""
 
     tasks: tuple[str, ...]
     world: WorldSettings
@@ -79,7 +79,7 @@ class TargetTraining(fit.Training):
         return target, lambda step: imitation.loss(draw(step), step), imitation.validate, write
 
     def seconds(self) -> float:
-        """Measure a few steps on demonstrations of one task, and estimate the time of all steps."""
+        """Estimate the seconds of all steps, from a few steps on demonstrations of one task."""
         chosen = self.dataset.of_tasks(self.tasks[0])[: fit.FEW]
         few = replace(self.dataset, episodes=[self.dataset.episodes[index] for index in chosen])
         target, loss, *_ = self.ready(few, lambda *done: None)
@@ -87,9 +87,10 @@ class TargetTraining(fit.Training):
 
 
 def plan_target(settings: TrainTargetSettings, database: Database) -> Plan[tuple[Path, fit.Metrics]]:
-    """Check a training of a compact policy. Its work returns the target's folder and the metrics of the best weights.
+    """Check the settings of a training, and return the plan to train a compact policy or to go on with its training.
 
-    It fills in `settings.demos`, `settings.task` and `settings.train.places`. An interrupted training goes on.
+    Fills in `settings.demos`, `settings.task` and `settings.train.places`. `Plan.make` returns the target's folder and
+    the metrics of the best weights.
     """
     folder, train = new_target(settings.results, settings.name), settings.train
     refuse_contradictions(settings)
@@ -252,13 +253,14 @@ def load_samples(
 
 
 def waypoints_of(episode: DemoEpisode, steps: np.ndarray, count: int, actions: ActionSpace) -> Tensor:
-    """Return where the hand will be at the next gripper changes, and at the episode's end: (n, K, 3) float32, metres.
+    """Return where the hand will be at the next K − 1 gripper changes and at the end: (n, K, 3) float32, metres.
 
     A gripper change is a control step in which the expert's command of a strict DoF moves by more than an eighth of its
     range. No simulator state is needed.
 
     Args:
         steps: (n,) control steps.
+        count: K, number of positions.
     """
     commands = episode.labels[: episode.steps, actions.is_strict]
     changes = np.flatnonzero((abs(np.diff(commands, axis=0)) > actions.half[actions.is_strict] / 4).any(-1)) + 1
@@ -270,9 +272,9 @@ def waypoints_of(episode: DemoEpisode, steps: np.ndarray, count: int, actions: A
 
 
 def task_weights(tasks: Tensor, balance: float) -> Tensor | None:
-    """Return how likely each sample is to be drawn: (n,) float64; None if all are equally likely.
+    """Return a weight per sample, (n,) float64, with which samples are drawn. None if all are equally likely.
 
-    A task that has the share p of the samples is drawn in proportion to p^(1 − balance). `tasks`: (n,) indices.
+    A task with the share p of the samples is drawn in proportion to p^(1 − balance). `tasks` (n,) are task indices.
     """
     if balance == 0:
         return None

@@ -55,7 +55,7 @@ def instruction_of(task: str) -> str:
 
 
 def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the full names of tasks and suites, such as `MT10` or `mt50`, in their order and without repetitions."""
+    """Return the full names of the tasks that `names` (tasks or suites, such as `MT10`) stand for, each once."""
     if not names:
         raise UsageError("name at least one task or suite: task=NAME")
     environments = specs().values()

@@ -93,7 +93,7 @@ def choose_backend() -> str:
 
 @functools.cache
 def find_backend() -> tuple[str, str]:
-    """Return the name of a working OpenGL backend, or an error message. The other one is empty."""
+    """Return the name of a working OpenGL backend and "", or "" and an error message."""
     # Software rendering with a thread pool per context is slower for small frames and crowds out other workers.
     os.environ.setdefault("LP_NUM_THREADS", "0")
     backend = os.environ.get("MUJOCO_GL", "").lower().strip()
@@ -178,7 +178,7 @@ class Camera:
 
 
 def box_average(pixels: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
-    """Return the mean of every block of factor x factor pixels (uint8), rounded to the nearest; at most 16."""
+    """Return the mean of every block of factor x factor pixels (uint8), rounded. `factor` is at most 16."""
     if factor == 1:
         return pixels.copy()
     total = np.full((pixels.shape[0] // factor, pixels.shape[1] // factor, pixels.shape[2]), factor**2 // 2, np.uint16)

@@ -53,7 +53,7 @@ class StressSettings:
 
 @dataclass
 class RolloutWorldSettings(WorldSettings):
-    """Settings of a rollout's world. A stress can make it differ from the world of the demonstrations."""
+    """Settings of a rollout's world. A stress makes this world differ from that of the demonstrations."""
 
     stress: StressSettings = setting(StressSettings, "disturbance of the world")
 

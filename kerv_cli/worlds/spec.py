@@ -30,7 +30,7 @@ Expert: TypeAlias = Callable[[Observation], NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Seeds:
-    """Three disjoint ranges of episode seeds, so that their initial states differ.
+    """Three disjoint ranges of episode seeds, so that training and evaluation share no initial state.
 
     Attributes:
         training: Seeds for demonstrations.
@@ -69,7 +69,7 @@ class EnvironmentSpec:
             proprioception.
         tasks: The tasks by full name.
         suites: The full names of each suite's tasks, by the suite's name in capitals.
-        horizon: Largest number of control steps of an episode. It is the default of tasks that name none.
+        horizon: Largest number of control steps of an episode. Tasks without a horizon of their own use it.
         cameras: Names of the cameras. The first is the default.
         world_class: `module:class` of the `World`. Empty for a recorded dataset, in which nothing can be executed.
         expert_class: `module:class`, called with (spec, task) to make an `Expert`. Empty if there are no experts.
@@ -141,7 +141,7 @@ class EnvironmentSpec:
 
         Args:
             horizon: The number to check. 0 stands for the default of the tasks.
-            tasks: Full or short names. None stand for the environment.
+            tasks: Full or short names. If there are none, the default is the environment's horizon.
 
         Raises:
             UsageError: The simulator cannot run that many control steps, or the tasks have different defaults.

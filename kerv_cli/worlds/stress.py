@@ -87,7 +87,7 @@ class Stress:
         """Change the MuJoCo model after a reset. Call `changes.keep` with each array before changing it."""
 
     def act(self, action: Array, step: int) -> Array:
-        """Return the action (D,) to execute, given the policy's (D,) within the limits.
+        """Return the action (D,) to execute in place of the policy's `action` (D,), which is within the limits.
 
         Called once per control step, in order.
         """

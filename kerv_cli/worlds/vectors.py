@@ -15,9 +15,9 @@ _SPLIT = 2.0**27 + 1.0  # Dekker's constant: splits a double into two halves who
 
 
 def length(vector: NDArray[np.float64]) -> float:
-    """Return the length of a vector (n,), each of whose squares is computed and added with a single rounding.
+    """Return the length of a vector (n,). Squaring a number and adding the square to the sum rounds only once.
 
-    OpenBLAS worked like this on the CPUs that recorded the first datasets (AVX-512, up to 31 numbers). So those
+    OpenBLAS rounded like this on the CPUs that recorded the first datasets (AVX-512, up to 31 numbers). So those
     datasets can be recorded again bit by bit.
     """
     total = 0.0

@@ -186,7 +186,7 @@ class EagleExamples(Decodes):
     Attributes:
         lengths: (n,) int64, number of prompt tokens P.
         prompt: (n, longest prompt, E) float16, encoded prompts.
-        hidden: (n, longest prompt + N − 1, E) float16, the target's last hidden states.
+        hidden: (n, longest prompt + N − 1, E) float16, hidden states of the target's last layer.
     """
 
     lengths: Tensor

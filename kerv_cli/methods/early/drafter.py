@@ -50,7 +50,7 @@ class Block(nn.Module):
 
 
 class EarlyNetwork(Compilable):
-    """A residual network from the pooled prompt to a few features per token, of which one head makes logits."""
+    """A residual network from the pooled prompt to a few features per token. One head computes logits from them."""
 
     mean: Tensor  # (F,) mean of the training features
     scale: Tensor  # (F,) 1 / standard deviation of the training features
@@ -101,9 +101,9 @@ class EarlyNetwork(Compilable):
 def choose(logits: Tensor, radius: int, strict: Tensor) -> tuple[Tensor, Tensor]:
     """Choose the tokens that are most likely to be accepted, and estimate the probability that all are accepted.
 
-    The best bin has the most probability within `radius` bins around it. Of about equally good bins, the one with more
-    probability close to it wins, because it is likely nearer to the target's token. A strict token is the most probable
-    bin. The estimate is too low: it treats tokens as independent. Use it only to compare chunks.
+    The chosen bin has the most probability within `radius` bins around it. Of about equally good bins, the one with
+    more probability close by wins, because it is likely nearer to the target's token. For a strict token, the most
+    probable bin is chosen. The estimate treats tokens as independent, so it is too low: use it only to compare chunks.
 
     Args:
         logits: (B, N, V).
@@ -210,7 +210,7 @@ class EarlyDrafter(TrainableDrafter):
         return loss, {"token_loss": float(loss.detach())}
 
     def validate(self, network: Any, target: Any, held_out: Any, settings: Any) -> Metrics:
-        """Score: tokens accepted strictly, plus those at r = 9. Perturbed episodes weigh as much as the others."""
+        """Score: mean number of tokens accepted at radius 0, plus that at radius 9 (see `measure`)."""
         batches = held_out.features.split(256)
         logits = torch.cat([network(batch.to(target.device).float()).cpu() for batch in batches])
         strict = torch.from_numpy(target.actions.strict_tokens(logits.shape[1]))

@@ -48,8 +48,8 @@ class BoundaryRanges:
     A range goes from the minimum to the 95th percentile. The infinite radii of straight paths do not count.
 
     Attributes:
-        points: Pairs (scaled R, scaled D), each in [0, 1], of POINTS windows that are evenly spread in their sum. They
-            give the quantiles of F. Empty in calibrations before version 1.1.
+        points: Pairs (scaled R, scaled D), each in [0, 1], of POINTS windows, evenly chosen from all windows sorted by
+            R + D. The quantiles of F are computed from these. Empty in calibrations before version 1.1.
     """
 
     radius_low: float
@@ -65,7 +65,7 @@ class BoundaryRanges:
 
     @classmethod
     def fit(cls, paths: Iterable[np.ndarray], window: int) -> BoundaryRanges:
-        """Measure the ranges over all windows of some episodes' hand positions, (T, 3) metres each."""
+        """Measure the ranges over all windows of up to `window` hand positions. Paths are (T, 3) in metres."""
         measured = []
         for path in paths:
             for end in range(LEAST, len(path) + 1):
@@ -108,5 +108,5 @@ class BoundaryRanges:
         return alpha * radius + (1 - alpha) * length
 
     def of_path(self, points: np.ndarray, alpha: float) -> float:
-        """Return F of a path through points (n, 3), in metres, with the weight `alpha` of the radius."""
+        """Return F of a path (n, 3) in metres: alpha · scaled radius + (1 − alpha) · scaled length."""
         return self.fused(radius_of_curvature(points), path_length(points), alpha)

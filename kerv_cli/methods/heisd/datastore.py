@@ -1,9 +1,9 @@
 """The datastore: demonstrated chunks, found by similarity and merged into a draft tree (docs/methods.md §4.1, §4.2).
 
-Each entry has a key and a chunk: the observation as the target encodes it, and the expert's next H actions as tokens.
-For each chosen segment of the prompt, the mean token is L2-normalised. These vectors are concatenated, and the result
-is normalised again. By default the key is made of the segment `scene` alone, which encodes hand, object and goal. On
-MT10 a key with vision tokens finds less similar chunks.
+An entry has a key, made from an observation, and a chunk: the expert's next H actions as tokens. For the key, the
+target encodes the observation as a prompt. The mean token of each chosen segment of the prompt is L2-normalised. These
+vectors are concatenated, and the result is normalised again. By default the only segment is `scene`, which encodes
+hand, object and goal. On MT10 a key with vision tokens finds less similar chunks.
 
 A datastore is a folder with `vectors.npy` (rows, d) float32 or float16, `payload.parquet`, `manifest.json` and, if keys
 are projected onto their leading directions, `projection.npy`. Rows are sorted by task, seed and step.
@@ -91,7 +91,7 @@ def prompt_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) 
         prompt: (B, P, E) encoded prompts.
 
     Returns:
-        (B, S · E) float32 keys, each with the norm 1.
+        (B, S · E) float32 keys for S segments, each with the norm 1.
     """
     parts = target.segments
     for name in segments:
@@ -169,7 +169,7 @@ class Datastore:
 
     @classmethod
     def open(cls, folder: Path, description: TargetDescription) -> Datastore:
-        """Open a datastore, and check that it was built for a target."""
+        """Open a datastore, and check that it was built for the described target."""
         manifest = DatastoreArtifact().checked(folder, description)
         rows, size = manifest.rows, manifest.actions.longest(manifest.chunk)
         try:
@@ -209,7 +209,7 @@ class Datastore:
         return Neighbours(similarity, chunks, self.seeds[rows], self.steps[rows], self.left[rows])
 
     def candidates(self, key: np.ndarray, shard: slice, k: int, without: int | None) -> np.ndarray:
-        """Return, in ascending order, the rows of the k most similar entries and of all that rounding may hide."""
+        """Return, in ascending order, all rows that may be among the k most similar, given float32 rounding errors."""
         scores = self.vectors[shard] @ key
         if without is not None:
             scores[self.seeds[shard] == without] = -np.inf
@@ -289,7 +289,11 @@ def neighbour_tree(
     order = count()
 
     def offer(parent: int, level: int, last: int, whole: int, cost: float) -> None:
-        """Offer the groups that may come next on a path, those of the most similar neighbours first."""
+        """Add the groups that may come next on a path to `waiting`, groups of the most similar neighbours first.
+
+        `last`: neighbours that have the path's last group. `whole`: neighbours that have all groups of the path since
+        it last changed to another neighbour.
+        """
         strict, givers = levels[level] if level < len(levels) else (False, [])
         pool = last if strict else everyone
         if strict:

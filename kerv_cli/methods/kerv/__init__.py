@@ -104,7 +104,7 @@ class Compensation(Rectifier):
     """KERV: after a rejected draft token, keeps the tokens before it and predicts the rest of the control step.
 
     `CompensateSettings` say what else is kept and predicted. With `predictor=draft` (ours) the remaining tokens of the
-    rejected draft fill first: a draft was made from the observation, a prediction only from past actions.
+    rejected draft are used first: a draft depends on the observation, a prediction only on past actions.
     """
 
     def __init__(self, settings: CompensateSettings, predictor: Predictor) -> None:
@@ -206,8 +206,8 @@ class ScheduleThresholdSettings(RadiusRange):
 class Variable(Threshold):
     """KERV: the acceptance radius r follows the variability K, the distance of draft tokens to target tokens.
 
-    After each decode that compared drafts, r becomes, with f(x) = r_min + (r_max − r_min) · exp(−(x / K_S)^φ) and the
-    change ΔK since the last such decode:
+    Let f(x) = r_min + (r_max − r_min) · exp(−(x / K_S)^φ), and let ΔK be the change of K since the last decode that
+    compared drafts. After each such decode, r becomes:
 
     - `change`: r ± (r_max − f(|ΔK|)). r shrinks if K has risen, and grows if K has fallen.
     - `offset` (KERV's README): f(|ΔK|). So r is large while K is steady.

@@ -1,6 +1,6 @@
 """Predict the next actions from the last actions: as a draft, and after a rejection (docs/methods.md §3.1).
 
-For a given noise and window length, every prediction is a fixed linear function of the last actions, whose weights are
+For a given noise and window length, every prediction is a weighted sum of the last actions. The weights are fixed and
 computed once. Actions are normalised to [-1, 1]. The unit of time is a control step.
 
 Shapes: D degrees of freedom of an action, m past actions, B histories of actions.
@@ -45,14 +45,14 @@ class Noise:
 
 @functools.lru_cache(maxsize=64)
 def filter_state(ratio: float, window: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights by which a Kalman filter's state depends on the last actions.
+    """Return the weights of the last actions in the state of a Kalman filter with the noise ratio q / r.
 
     The state is [action, velocity]. The filter begins at the first action a₀ with the state [a₀, 0] and the covariance
     r · I. For each further action the filter predicts and updates once.
 
     Returns:
         Two matrices. The weights (2, window) times the actions (oldest first) give the state after the last action. The
-        transition matrix (2, 2) advances a state by one control step.
+        transition matrix (2, 2) times a state gives the state one control step later.
     """
     from filterpy.kalman import KalmanFilter
 
@@ -72,13 +72,13 @@ def filter_state(ratio: float, window: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def kalman_weights(q: float, r: float, window: int, horizon: int) -> np.ndarray:
-    """Return the weights (horizon, window) of the past actions, oldest first, in one DoF's predictions."""
+    """Return the weights (horizon, window) with which past actions, oldest first, add up to the predictions."""
     state, transition = filter_state(q / r, window)
     return np.stack([(np.linalg.matrix_power(transition, h) @ state)[0] for h in range(1, horizon + 1)])
 
 
 class Predictor:
-    """Base of predictors. They compute the next actions from the last actions. Strict DoFs keep their last value.
+    """Base class of predictors of the next actions from the last actions. Strict DoFs keep their last value.
 
     Attributes:
         name: Name of the predictor in settings.
@@ -167,10 +167,11 @@ class Kalman(Predictor):
 
 
 class Walk(Predictor):
-    """The filter of KERV's public code: a random walk per DoF, on token ids, with Q = 1 and R = 1e-3.
+    """The filter of KERV's public code: a random walk per DoF with Q = 1 and R = 1e-3.
 
     Its gain is 0.999, so it nearly repeats the last action. The filter starts at the first action, with the variance R.
-    A token id is a normalised value times a scale plus an offset, so the weights are the same for both.
+    The public code filters token ids, kerv normalised values. The predictions are the same, because a token id is a
+    linear function of the value.
     """
 
     name = "walk"
@@ -215,8 +216,8 @@ def assemble(
     """Assemble the actions of a compensated chunk: known tokens, then drafted tokens, then predictions.
 
     `settings.steps` control steps are filled, beginning with the first step that is not completely known. One step
-    fewer is filled if fewer than `min_verified` DoFs of that first step are known. One step fewer is also filled if
-    none of them is known and the setting `drop` is true. Neither rule applies to the first control step of the chunk.
+    fewer is filled if fewer than `min_verified` DoFs of that first step are known, or if none of its DoFs is known and
+    the setting `drop` is true. Neither rule applies to the first control step of the chunk.
 
     Returns:
         (S, D) normalised actions of the chunk's first S control steps, known and filled ones. None if there are too few

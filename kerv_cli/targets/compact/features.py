@@ -135,8 +135,8 @@ class WordTokenizer:
 class Residual(nn.Module):
     """Residual block: a norm and two 3 × 3 convolutions.
 
-    The norm is `group` (eight groups of channels) or `instance` (each channel by itself), which makes the output least
-    sensitive to light and colour. Both norms have weights of the same shapes.
+    The norm is `group` (eight groups of channels) or `instance` (each channel by itself). `instance` makes the output
+    least sensitive to light and colour. Both norms have weights of the same shapes.
     """
 
     def __init__(self, channels: int, norm: str = "group") -> None:
@@ -196,7 +196,7 @@ class VisionEncoder(Compilable):
         return tokens, self.points(heat)
 
     def points(self, heat: Tensor) -> Tensor:
-        """Return image points (B, 2K) in [-1, 1]: the expected column of each heat map (B, K, h, w), then each row."""
+        """Return image points (B, 2K) in [-1, 1]: each heat map's expected column, then each one's expected row."""
         batch, keypoints, height, width = heat.shape
         scaled = heat.float() * self.temperature[:, None, None].float()
         weight = scaled.flatten(2).softmax(-1).view(batch, keypoints, height, width)
@@ -208,9 +208,9 @@ class VisionEncoder(Compilable):
 def compiled_encoder(encoder: nn.Module, size: int) -> Callable[[Tensor], list[Tensor]]:
     """Return a function that runs a vision encoder on one image in ONNX Runtime, which is faster on a CPU than torch.
 
-    torch calls oneDNN for each convolution, and each call takes 19 µs before it computes anything. The smallest
-    drafter's encoder has eleven. Measured on an AMD EPYC, 96 × 96 pixels, 8 channels: 607 µs in torch, 270 µs in ONNX
-    Runtime, which uses as many threads as torch has at the time of this call.
+    torch calls oneDNN for each convolution, and each call takes 19 µs before it computes anything. Measured on an AMD
+    EPYC, 96 × 96 pixels, 8 channels: 607 µs in torch, 270 µs in ONNX Runtime. ONNX Runtime uses as many threads as
+    torch has at the time of this call.
 
     Args:
         encoder: Maps images (1, 3, size, size) uint8 to vision tokens (1, grid², E) and K image points (1, 2K).

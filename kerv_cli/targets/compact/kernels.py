@@ -46,12 +46,13 @@ NUMBER, WORD, LANE, VOID, ADDRESS = ir.FloatType(), ir.IntType(64), ir.IntType(3
 def _tile(rows: int, kind: int, lanes: int) -> Callable[..., None]:
     """Generate the innermost loop of a matrix multiplication: y = (x · weights) · scale + bias.
 
-    The loop computes `lanes` outputs of one panel for `rows` rows. All sums stay in registers.
+    The loop multiplies `rows` rows of x by `lanes` columns of one panel. All sums stay in registers. `kind` is the
+    number format of the weights.
 
     Returns:
-        A function of (weights, factors, inputs, x, stride, y, step). `inputs` is the number of inputs. `weights`
-            (inputs, PANEL), `factors` (2, PANEL; scales, then biases), `x` and `y` are memory addresses. Two rows of x
-            are `stride` bytes apart, and two rows of y are `step` bytes apart.
+        A function of (weights, factors, inputs, x, stride, y, step). Four of these are memory addresses: of the weights
+            (inputs, PANEL), of the factors (2, PANEL; scales, then biases), of x, and of y. `inputs` is the number of
+            inputs. The rows of x are `stride` bytes apart, those of y `step` bytes.
     """
     formats = {HALF: (ir.HalfType(), 2), INT8: (ir.IntType(8), 1), FLOAT: (NUMBER, 4), BFLOAT: (ir.IntType(16), 2)}
     stored, size = formats[kind]
@@ -287,8 +288,8 @@ def sum_of_exponentials(x, most):
 def choose(frame, columns, numbers):
     """Choose the tokens of a chunk, and estimate the probability that all are accepted, like `early.drafter.choose`.
 
-    `frame` (size,) holds the logits, and afterwards the result. The operation has a constant per token: 1 if it must
-    equal the target's.
+    `frame` (size,) holds the logits, and afterwards the result. `numbers` holds 1 for each token that must equal the
+    target's token, else 0.
     """
     out, a, rows, width, stride, first = columns[1], columns[2], columns[4], columns[5], columns[6], columns[7]
     radius, odds = int(frame[columns[3]]), _ONE
@@ -318,9 +319,9 @@ def choose(frame, columns, numbers):
 
 @compiled
 def elementwise(code, frame, columns, numbers, indices):
-    """Execute one operation on one frame, in place.
+    """Execute one operation on one frame, in place. LINEAR, ATTEND and BRANCH are executed by `run` instead.
 
-    `columns` are its `recording.COLUMNS`. `run` itself executes LINEAR, ATTEND and BRANCH.
+    `columns` is the operation's row in the table of operations (`recording.COLUMNS`).
     """
     out, a, b = columns[1], columns[2], columns[3]
     rows, width, stride, first = columns[4], columns[5], columns[6], columns[7]

@@ -53,7 +53,7 @@ def own_folder() -> Path:
 def kernels() -> ModuleType:
     """Return the module of compiled kernels.
 
-    The first process on a machine compiles them, which takes fifteen seconds. Other processes wait for it.
+    The first process on a machine compiles the kernels, which takes fifteen seconds. Meanwhile other processes wait.
     """
     import numba
     from numba.core import event
@@ -88,9 +88,9 @@ class Blocked:
     """The weights (outputs, inputs) of a linear layer in bfloat16, in oneDNN's blocked layout.
 
     One token and thirty tokens take almost the same time, because most time is spent on reading the weights. All other
-    operations of a program are float32. They are cheap, and rounding them would more often make the two best logits
-    almost equal. oneDNN adds in a different order for one token than for many, so the last bit of a result depends on
-    the number of tokens (docs/measuring.md).
+    operations of a program stay float32: in bfloat16 they would save little time, and the two best logits would be
+    almost equal more often. oneDNN adds in a different order for one token than for many, so the last bit of a result
+    depends on the number of tokens (docs/measuring.md).
     """
 
     def __init__(self, weight: Tensor, bias: Tensor | None) -> None:
@@ -270,7 +270,7 @@ class Program:
         results: np.ndarray | None = None,
         end: int | None = None,
     ) -> np.ndarray:
-        """Execute the program as many times as `results` has rows, or once. Return the frames (rows, size).
+        """Execute the program len(results) times, or once without `results`. Return the frames (rows, size).
 
         Args:
             results: (times, 1, B) float32, or (levels, 4, top_k²) for `grow`. It is filled with the results of each

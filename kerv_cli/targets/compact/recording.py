@@ -93,7 +93,7 @@ class Recorded:
         return self.affine(1.0 / other, 0.0)
 
     def affine(self, factor: Any, offset: Any) -> Recorded:
-        """Return self · factor + offset. Both are constants: numbers, or tensors that broadcast with this value."""
+        """Return self · factor + offset. `factor` and `offset` are numbers, or constant tensors that broadcast."""
         factor, offset = torch.as_tensor(factor, dtype=torch.float32), torch.as_tensor(offset, dtype=torch.float32)
         place, factor, offset = torch.broadcast_tensors(self.place, factor, offset)
         numbers = torch.cat([factor.flatten(), offset.flatten()])
@@ -114,8 +114,8 @@ class Recorded:
     def branch(self, hidden: Recorded) -> tuple[Recorded, Recorded]:
         """Record the operation that grows one level of a draft tree; see `Program.grow`.
 
-        Each row of the batch stands for one node of the tree. This value has the logits of the node's children,
-        `hidden` (…, E) is the node's hidden state.
+        Each row of the batch stands for one node of the tree. `self` holds the logits of the node's children, and
+        `hidden` (…, E) the node's hidden state.
 
         Returns:
             The token (1,) of the node that the row stands for afterwards, and the hidden state (…, E) of its parent.
@@ -125,7 +125,7 @@ class Recorded:
         return out[:1], out[1:].view(hidden.shape)
 
     def choose(self, radius: Recorded, strict: Tensor) -> Recorded:
-        """Choose the tokens of a chunk from this value's logits (1, N, V), as `early.drafter.choose` does.
+        """Record the choice of a chunk's tokens from the logits `self` (1, N, V), see `early.drafter.choose`.
 
         Args:
             radius: (1, 1) acceptance radius, in bins.
@@ -137,7 +137,7 @@ class Recorded:
         return self.tape.emit(CHOOSE, (1, len(strict) + 1), [self, radius], self.shape[-1], strict)
 
     def attend(self, heads: int, cos: Tensor, sin: Tensor) -> Recorded:
-        """Record the attention of the next layer. This value has 3 E columns: E of queries, E of keys, E of values.
+        """Record the attention of the next layer. `self` has 3 E columns: E for queries, E for keys, E for values.
 
         Args:
             cos: (positions, 1, C) rotary cosines, for every position that can occur.

@@ -204,7 +204,7 @@ class CompactTarget(Compilable):
         return self.prompt(*given)
 
     def prompt(self, words: Tensor, proprioception: Tensor, *seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute in torch what `encode_batch` returns.
+        """Return the prompts and positions of `encode_batch`, computed by the PyTorch modules.
 
         Args:
             words: (B, L) ids of words.
@@ -288,7 +288,7 @@ class CompactTarget(Compilable):
     def parallel_pass(self, prompt: Tensor, cache: Cache | None = None) -> Tensor:
         """Forward learned queries in place of action tokens (docs/methods.md §6).
 
-        They attend to the prompt and to each other.
+        Every query attends to the prompt and to all queries.
         """
         x = torch.cat([prompt, self.queries.to(prompt.dtype).expand(len(prompt), -1, -1)], 1)
         visible = np.tri(x.shape[1], dtype=bool)
@@ -296,7 +296,7 @@ class CompactTarget(Compilable):
         return self(x, torch.arange(x.shape[1], device=x.device), cache, visible)[:, prompt.shape[1] :]
 
     def teacher_forced(self, inputs: Inputs, tokens: Tensor) -> tuple[Tensor, Tensor]:
-        """Return logits (B, N, V) of the true tokens (B, N) of a chunk, and the positions (B, K, 3) of `encode_batch`.
+        """Return logits (B, N, V) that predict the true `tokens` (B, N), and the positions (B, K, 3) of `encode_batch`.
 
         A parallel target does not read the tokens.
         """

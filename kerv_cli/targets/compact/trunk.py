@@ -116,7 +116,7 @@ class LayerStack(Compilable):
         return self.norm(x if self.width == self.outer else x[..., : self.outer])
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
-        """Return an empty key/value cache. `fixed`: for CUDA graphs of one sequence. If None, only on CUDA."""
+        """Return an empty cache. If `fixed` and of batch size 1, it is for CUDA graphs. None: fixed on CUDA only."""
         like = self.weight
         if self.compiled is not None:
             like = like.float()
@@ -174,7 +174,7 @@ class LayerStack(Compilable):
 
 
 class Trunk(LayerStack):
-    """The target's decoder layers. The head and the drafter read the hidden states that it returns."""
+    """The target's decoder layers. Their output, the hidden states, is read by the head and the drafter."""
 
     def __init__(self, width: int, layers: int, heads: int, feed_forward: int) -> None:
         super().__init__(width, layers, heads, feed_forward)

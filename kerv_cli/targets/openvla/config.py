@@ -145,8 +145,8 @@ class Bounds:
 def read_statistics(folder: Path, name: str | None) -> tuple[str, Bounds]:
     """Return the name and the action statistics of a data set.
 
-    If `name` is None, the checkpoint must have only one. A fine-tuned checkpoint has them in `dataset_statistics.json`,
-    any other in the field `norm_stats` of `config.json`.
+    If `name` is None, the checkpoint must have the statistics of a single data set. A fine-tuned checkpoint stores its
+    statistics in `dataset_statistics.json`, any other in the field `norm_stats` of `config.json`.
     """
     path = folder / STATISTICS
     statistics = read_json(path) if path.is_file() else read_config(folder).get("norm_stats")
@@ -165,7 +165,7 @@ def action_space(shape: Shape, bounds: Bounds, like: ActionSpace | None, control
     """Return the action space of a checkpoint.
 
     Args:
-        bounds: Become `low` and `high` of the space. A DoF that `bounds.mask` excludes gets -1 and 1.
+        bounds: The percentiles become `low` and `high` of the space. A DoF that `bounds.mask` excludes gets -1 and 1.
         like: Action space of an environment, from which names, groups, strict DoFs and control rate are copied. If
             None, the space has OpenVLA's seven DoFs and the rate `control_hz`.
     """

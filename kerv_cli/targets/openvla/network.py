@@ -1,7 +1,7 @@
-"""The network of OpenVLA: two vision towers, a projector, and Llama-2 as the compact target's trunk.
+"""The network of OpenVLA: two vision towers, a projector, and Llama-2, which is built from the compact target's trunk.
 
-Weights without effect are left out: the last block of each tower (OpenVLA takes the output of the block before it), the
-final norm, and SigLIP's pooling head.
+Weights without effect are left out: the last block of each tower (OpenVLA takes the output of the block before it),
+each tower's final norm, and SigLIP's pooling head.
 
 Shapes: B batch, h × w pixels of an image, n patches, W width of a tower.
 """
@@ -32,7 +32,7 @@ LAYER = {
 
 
 def published(name: str) -> list[str]:
-    """Return the names of the tensors in published checkpoints whose rows make the model's tensor `name`."""
+    """Return the names of the published tensors that, joined along their rows, make the model's tensor `name`."""
     match = re.fullmatch(r"(language_model\.model\.layers\.\d+)\.(\w+)\.weight", name)
     return [f"{match[1]}.{part}.weight" for part in LAYER[match[2]]] if match else [name]
 
@@ -124,7 +124,7 @@ class VisionTower(nn.Module):
 
 
 class VisionBackbone(nn.Module):
-    """Both vision towers. Images (B, 6, h, w) have three channels for each. Their outputs are concatenated."""
+    """Both vision towers. Images (B, 6, h, w) have three channels per tower. The towers' outputs are concatenated."""
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()
@@ -141,7 +141,7 @@ def projector(shape: Shape) -> nn.Sequential:
 
 
 class OpenVLAModel(nn.Module):
-    """All modules of an OpenVLA. Except for the layers' (`LAYER`), they have the names in published checkpoints."""
+    """All modules of OpenVLA. Tensors have their published names, except in the language model's layers (`LAYER`)."""
 
     def __init__(self, shape: Shape) -> None:
         super().__init__()

@@ -24,7 +24,7 @@ FORMAT = 2  # of the manifest
 
 @dataclass(frozen=True)
 class EpisodeEntry:
-    """One episode in the manifest of a dataset. `bytes` and `sha256` are of its file."""
+    """One episode in the manifest of a dataset. `bytes` is the size of its file, `sha256` the file's hash."""
 
     seed: int
     # whether noise was added to the executed actions, or an actor moved the robot instead of the expert
@@ -46,7 +46,7 @@ class EpisodeEntry:
 
 @dataclass(frozen=True)
 class TaskEntry:
-    """The episodes of one task in a manifest, sorted by seed. In `failed_seeds` the expert did not succeed."""
+    """The episodes of one task in a manifest, sorted by seed. The expert did not succeed with the `failed_seeds`."""
 
     episodes: tuple[EpisodeEntry, ...]
     mean_steps: float = 0.0
@@ -83,9 +83,9 @@ def _facts(manifest: DemoManifest) -> dict[str, Any]:
 def register_recorded(
     name: str, actions: ActionSpace, observation: ObservationSpace, instructions: Mapping[str, str], camera: str
 ) -> EnvironmentSpec:
-    """Register an environment for imported data, in which nothing can be executed.
+    """Register an environment for imported data. No episode can run in it.
 
-    Its name in capitals is a suite of all tasks.
+    All tasks form a suite. The suite's name is the environment's name in capitals.
     """
     tasks = {task: Task(task, instruction) for task, instruction in instructions.items()}
     suites = {name.upper(): tuple(tasks)}
@@ -183,7 +183,7 @@ class DemoDataset:
 
     @classmethod
     def joined(cls, parts: Sequence[DemoDataset]) -> DemoDataset:
-        """Join datasets. The manifest is the first one's, with the tasks of all and a hash over their hashes."""
+        """Join datasets under the first one's manifest, with the tasks of all datasets and a hash over their hashes."""
         if len(parts) == 1:
             return parts[0]
         first, ours = parts[0].manifest, _facts(parts[0].manifest)

@@ -137,8 +137,8 @@ LENGTH = struct.Struct("<Q")  # a safetensors file begins with the length of its
 class EncodedFrames:
     """Images (n, size, width, 3) uint8 that are decoded when they are used. A wider PNG is cut off at the right.
 
-    `spans` (n, 3) int64 has for each image the index into `files`, and the positions of the PNG's first byte and after
-    its last.
+    `spans` (n, 3) int64 holds, for each image, the index of its file in `files`, the position of the PNG's first byte,
+    and the position after its last byte.
     """
 
     def __init__(self, files: Sequence[Path], spans: NDArray[np.int64], size: int, width: int) -> None:

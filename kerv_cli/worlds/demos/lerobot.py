@@ -60,7 +60,7 @@ class Source:
 
     @classmethod
     def open(cls, folder: Path, camera: str) -> Source:
-        """Read the description of a dataset. An empty `camera` stands for the first one."""
+        """Read the description of a dataset. An empty `camera` stands for the first camera."""
         if folder.is_file():
             raise UsageError(f"{folder} is a file: name the folder of a LeRobot dataset, which holds meta/")
         if not (folder / INFO).is_file():
@@ -115,7 +115,7 @@ class Source:
         return self.path(episode, "data", self.info.get("data_path") or DATA)
 
     def frames(self, episode: Row, table: pa.Table) -> Iterator[np.ndarray]:
-        """Yield the T images (height, width, 3) uint8 of one episode, whose T rows are `table`."""
+        """Yield the T images (height, width, 3) uint8 of one episode. `table` holds the episode's T rows."""
         if self.info["features"][self.key]["dtype"] == "image":
             return _pictures(table[self.key], self.folder, self.data_path(episode))
         path = self.path(episode, f"videos/{self.key}", self.info.get("video_path") or VIDEO)
@@ -234,7 +234,7 @@ def _episode(source: Source, row: Row, path: Path, table: pa.Table, names: Mappi
 
 
 def action_space(source: Source, settings: DemosImportSettings, actions: np.ndarray) -> ActionSpace:
-    """Return the action space of a dataset, limited by the smallest and largest of some actions (n, D)."""
+    """Return the action space of a dataset. Its limits are the smallest and largest values in `actions` (n, D)."""
     names = tuple(source.names(ACTION, "action"))
     if settings.dofs == "openvla":
         if len(names) != len(OPENVLA):

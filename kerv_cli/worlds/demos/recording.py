@@ -83,7 +83,8 @@ MakeActor = Callable[[DemoConfig], Any]
 def run_expert(world: World, seed: int, config: DemoConfig, actor: Any) -> DemoEpisode | None:
     """Run one episode and label every state with the expert's action. An actor's episode is always returned.
 
-    None if the expert did not succeed within `config.horizon` steps, or too late for `config.tail` more.
+    Without an actor, return None if the expert did not succeed within `config.horizon` steps, or only when fewer than
+    `config.tail` steps were left.
     """
     expert = world.spec.expert(world.task)
     observation = world.reset(seed)
@@ -131,8 +132,8 @@ def record(
 ) -> DemoManifest:
     """Record demonstrations into a folder, or continue an interrupted recording.
 
-    The next seed after the requested range replaces one for which the expert fails. If too many fail, the dataset is
-    smaller. The episodes do not depend on the number of workers.
+    If the expert fails for a seed, the next seed after the requested range replaces that seed. If too many seeds fail,
+    the dataset is smaller. The episodes do not depend on the number of workers.
     """
     config.spec.check_installed()
     choose_backend()
@@ -258,7 +259,7 @@ def _record_seeds(
 
 
 SIGMA = 0.2, 0.6  # lowest and highest standard deviation of the Gaussian noise; 1 is half of a DoF's range
-BURST_PROBABILITY = 0.02  # of a burst's begin, per control step
+BURST_PROBABILITY = 0.02  # probability that a burst begins, per control step
 
 
 def is_perturbed(seed: int, fraction: float) -> bool:
@@ -267,7 +268,7 @@ def is_perturbed(seed: int, fraction: float) -> bool:
 
 
 class Perturbation:
-    """Noise for the actions (D,) of one episode, which stay within the limits.
+    """Adds noise to the actions (D,) of one episode. The noisy actions stay within the limits.
 
     The noise is Gaussian. Now and then, for 3 to 8 control steps, a burst in one random direction replaces the action.
     Strict DoFs (such as a gripper) are not changed.

@@ -1,7 +1,7 @@
-"""The tasks of LIBERO's four suites of ten, and of the versions that LIBERO-PRO changed.
+"""The tasks of LIBERO's four suites of ten tasks, and of LIBERO-PRO's changed versions of these suites.
 
-`tasks.csv` has a row per task: its file in the benchmark, from whose name the instruction is made, and the instructions
-of the versions `task` (another goal) and `lan` (other words).
+`tasks.csv` has a row per task. It gives the task's file in the benchmark, and the instructions of the versions `task`
+(another goal) and `lan` (other words). All other instructions are made from the file's name.
 """
 
 from __future__ import annotations
