@@ -1,7 +1,10 @@
 """LeRobot datasets of version 3 are read and trained on; what was made for other actions is refused."""
 
 import json
+import resource
 import shutil
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +25,7 @@ from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.openvla.config import Bounds, action_space
 from kerv_cli.worlds import instruction_of, specs
+from kerv_cli.worlds.demos import files
 from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.dataset import __name__ as dataset_module
 from kerv_cli.worlds.demos.files import encode_png
@@ -204,6 +208,55 @@ def test_a_folders_name_may_begin_with_a_digit_and_no_dof_need_be_strict(results
     assert DemoDataset.open(tmp_path / "artifacts/demos/2024_lift").manifest.actions.strict == ()
 
 
+def rewritten(source: Path, change: Callable[[pa.Table], pa.Table]) -> None:
+    """Change the table of a dataset, whose rows then make one episode."""
+    data, episodes = source / DATA.format(chunk_index=0, file_index=0), source / "meta/episodes/chunk-000"
+    rows = change(pq.read_table(data))
+    number = rows.column_names.index("episode_index")
+    rows = rows.set_column(number, "episode_index", pa.array(np.zeros(len(rows), np.int64)))
+    pq.write_table(rows, data, compression="zstd")
+    first = pq.read_table(episodes / "file-000.parquet").slice(0, 1).to_pylist()[0]
+    pq.write_table(pa.Table.from_pylist([{**first, "length": len(rows)}]), episodes / "file-000.parquet")
+
+
+def long_action(rows: pa.Table) -> pa.Table:
+    """Every action is 20 million zeros: some kilobytes on disk."""
+    zeros = pa.array([np.zeros(20_000_000, np.float32)])
+    return rows.slice(0, 1).set_column(rows.column_names.index("action"), "action", zeros)
+
+
+def long_cells(rows: pa.Table) -> pa.Table:
+    """1.5 GB of cells in a small file."""
+    picture = {"bytes": encode_png(np.zeros((8, 8, 3), np.uint8)) + bytes(5_000_000)}
+    rows = pa.concat_tables([rows.slice(0, 1)] * 300)
+    return rows.set_column(
+        rows.column_names.index("observation.images.front"), "observation.images.front", pa.array([picture] * 300)
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (None, ("info.json", "at most 65536 numbers")),
+        (long_action, ("file-000.parquet", "action has 20000000 numbers per row")),
+        (long_cells, ("file-000.parquet", "more than 1024 MiB in memory: split it")),
+    ],
+)
+def test_a_dataset_that_is_too_large_is_refused_in_one_line(results, tmp_path, change, said):
+    source = edited(results, tmp_path)
+    if change is None:
+        info = json.loads((source / "meta/info.json").read_text())
+        info["features"]["action"]["shape"] = [2**20, 2**20]
+        (source / "meta/info.json").write_text(json.dumps(info))
+    else:
+        rewritten(source, change)
+    begun, before = time.monotonic(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    refused = refusal("demos", "import", f"source={source}", "name=small", f"results={tmp_path}", code=1)
+    assert all(word in refused for word in said)
+    assert time.monotonic() - begun < 10
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 2 * 2**20  # kilobytes
+
+
 def test_episodes_may_be_in_any_order(results, tmp_path):
     source = edited(results, tmp_path)
     data = source / DATA.format(chunk_index=0, file_index=0)
@@ -345,3 +398,14 @@ def test_a_policy_of_seven_dofs_is_trained_and_decodes_with_its_drafters(spaces)
     tree = Parts(proposer=DrafterProposer(drafter, target, 5, 3, 12))
     for parts in (tree, Parts(prefill_draft=EarlyProposer(early, target))):
         assert Decoder(target, parts).decode(shown).tokens == plain.tokens
+
+
+def test_a_small_parquet_file_that_expands_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "MOST_EXPANDED", 2**24)
+    for name, column in enumerate((pa.array(["x" * 1000] * 50_000), np.zeros(2**22))):
+        path = tmp_path / f"{name}.parquet"
+        pq.write_table(pa.table({"a": column}), path, compression="zstd")
+        with pytest.raises(ValueError, match="expands to more than"):
+            files.foreign_table(path, ["a"])
+    pq.write_table(pa.table({"a": [1, 2, 3], "b": ["x", "y", "z"]}), path, row_group_size=1)
+    assert files.foreign_table(path, ["b", "c"]).to_pylist() == [{"b": "x"}, {"b": "y"}, {"b": "z"}]

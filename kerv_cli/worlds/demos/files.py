@@ -1,4 +1,7 @@
-"""Read and write episode files: safetensors with lossless PNG images (docs/formats.md)."""
+"""Read and write episode files, and read Parquet files that other programs wrote.
+
+An episode file is a safetensors file with lossless PNG images (docs/formats.md).
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from PIL import Image
 from safetensors import SafetensorError, safe_open
@@ -195,3 +200,22 @@ def encode_png(frame: NDArray[np.uint8], level: int = 6) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(frame).save(buffer, format="PNG", compress_level=level)
     return buffer.getvalue()
+
+
+MOST_EXPANDED = 2**30  # bytes of a table in memory
+
+
+def foreign_table(path: Path, columns: Sequence[str]) -> pa.Table:
+    """Read columns of a Parquet file of another program, which may be huge in memory. Ignore those that it lacks."""
+    total = 0
+    with pq.ParquetFile(path) as file:
+        chosen = [column for column in file.schema_arrow.names if column in columns]
+        schema = pa.schema([file.schema_arrow.field(column) for column in chosen], file.schema_arrow.metadata)
+        batches = []
+        # few rows at a time, because a file expands as it is read
+        for batch in file.iter_batches(256, None, chosen, use_threads=False):
+            total += batch.nbytes
+            if total > MOST_EXPANDED:
+                raise ValueError(f"{path} expands to more than {MOST_EXPANDED // 2**20} MiB in memory: split it")
+            batches.append(batch)
+    return pa.Table.from_batches(batches, schema)

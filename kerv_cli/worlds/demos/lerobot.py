@@ -21,7 +21,6 @@ from typing import Any, TypeAlias
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 from PIL import Image
 
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
@@ -29,7 +28,7 @@ from kerv_cli.base.files import read_mapping, write_folder, write_json
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, action_limits
 from kerv_cli.worlds import EnvironmentPart
 from kerv_cli.worlds.demos.dataset import FORMAT, DemoDataset, EpisodeEntry, OnProgress, check_recorded, totals
-from kerv_cli.worlds.demos.files import DemoEpisode
+from kerv_cli.worlds.demos.files import DemoEpisode, foreign_table
 from kerv_cli.worlds.settings import DemosImportSettings
 from kerv_cli.worlds.spec import EnvironmentSpec
 
@@ -40,6 +39,7 @@ VIDEO = f"videos/{{video_key}}/{CHUNK}.mp4"
 STATE, ENVIRONMENT, ACTION, EXECUTED = "observation.state", "observation.environment_state", "action", "action.executed"
 IMAGES = "observation.images."
 VECTORS = (ACTION, EXECUTED, STATE, ENVIRONMENT)
+MOST_NUMBERS = 65_536  # in the action or the state of one control step
 OPENVLA = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
 # PIL raises SyntaxError
 _DAMAGE = (OSError, ValueError, LookupError, TypeError, AttributeError, SyntaxError, pa.ArrowException)
@@ -101,6 +101,11 @@ class Source:
         if entry is None:
             return []
         names, count = entry.get("names"), math.prod(map(int, entry["shape"]))
+        if not 0 < count <= MOST_NUMBERS:
+            shape = str(entry["shape"])[:80]
+            raise CheckpointError(
+                f"{self.folder / INFO}: {feature} is of shape {shape}, at most {MOST_NUMBERS} numbers are read"
+            )
         if isinstance(names, dict):
             names = next(iter(names.values()), None)
         if not isinstance(names, list) or len(names) != count or len(set(names)) != count:
@@ -285,7 +290,7 @@ def _reading(path: Path) -> Iterator[None]:
 
 def _table(path: Path, columns: Sequence[str]) -> pa.Table:
     with _reading(path):
-        return pq.ParquetFile(path).read(columns, use_threads=False)
+        return foreign_table(path, columns)
 
 
 def _vectors(table: pa.Table, name: str) -> np.ndarray:
