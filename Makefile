@@ -29,9 +29,9 @@ test: lint ## check style, types and imports, then run the tests
 test-cpus: setup ## run the tests of equal bits and tokens under four kinds of CPU kernels
 	@$(BIN)/python scripts/cpus.py $(PARALLEL)
 
-demo: setup ## README's table in small: eight settings, one task, about four minutes
-	@echo "README's table in small: eight settings decode the same three episodes in turn, about four minutes on one core"
-	@$(BIN)/kerv build target grow=150m policy.target=mt10-vision name=mt10-150m > /dev/null
+demo: setup ## README's table in small: six settings, one task, about two minutes
+	@echo "README's table in small: six settings decode the same three episodes in turn, about two minutes on one core"
+	@$(BIN)/kerv build target grow=60m policy.target=mt10-vision name=mt10-60m > /dev/null
 	@$(BIN)/kerv sweep study=demo
 
 papers: setup ## train the policy of the papers' study by the commands of docs/training.md (90 minutes), then run a seed per task
@@ -58,7 +58,7 @@ release: setup ## build the wheel and the source into dist/, and run an episode 
 	@scripts/release.sh $(BIN)/python
 
 pages: setup ## fill the figures of README.md and results/README.md from results/tables
-	@$(BIN)/python scripts/figures.py README.md results/README.md
+	@$(BIN)/python scripts/figures.py README.md results/README.md results/details.md
 
 docs: setup ## build the pages as a site in build/site; a link that leads nowhere is an error
 	@$(BIN)/python -c 'import zensical' 2>/dev/null || $(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
