@@ -18,6 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = {
     "index.md": "README.md",
     "results.md": "results/README.md",
+    "details.md": "results/details.md",
     "log.md": "results/LOG.md",
 }
 """Page of the site -> its source, for those that do not lie in docs/."""

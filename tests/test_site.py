@@ -17,6 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCES = (
     "README.md",
     "results/README.md",
+    "results/details.md",
     "results/LOG.md",
     *(f"docs/{p.name}" for p in (ROOT / "docs").glob("*.md")),
 )
@@ -125,7 +126,7 @@ def test_the_first_page_fits_on_two_screens():
 
 # --- pages
 
-PAGES = ("README.md", "results/README.md")
+PAGES = ("README.md", "results/README.md", "results/details.md")
 
 
 @pytest.fixture
@@ -206,5 +207,13 @@ def test_tables_are_published_where_they_are_committed(figures, tmp_path, monkey
     assert "kerv report study=other" in capsys.readouterr().err
 
 
-def test_the_results_page_stays_a_page():
-    assert len((ROOT / "results/README.md").read_text(encoding="utf-8").splitlines()) <= 250
+def test_the_first_page_and_the_results_stay_short():
+    """Words with their tables; at most eight rows of at most seven columns on the first page, of six in the results."""
+    for page, words, tables, columns in (("README.md", 650, 1, 7), ("results/README.md", 1_700, 8, 6)):
+        text = (ROOT / page).read_text(encoding="utf-8")
+        shown = [part.splitlines() for part in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)]
+        said = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL).split()
+        assert sum(any(map(str.isalnum, word)) for word in said) <= words, page
+        assert len(shown) <= tables, page
+        assert max(len(rows) - 2 for rows in shown) <= 8, page
+        assert max(rows[0].count("|") - 1 for rows in shown) <= columns, page
