@@ -359,7 +359,7 @@ def _load_all() -> None:
 
 @functools.cache
 def load_plugins() -> None:
-    """Register the parts of plugins: of installed packages, and of the modules in `KERV_PLUGINS`.
+    """Register the parts that plugins define: installed packages, and modules named in `KERV_PLUGINS`.
 
     kerv's own parts are registered first, so that a plugin cannot take their names.
 

@@ -288,9 +288,9 @@ class ObservationSpace:
         proprioception: Names of the numbers of proprioception, the robot's own measurements. The first three are the
             end effector's position in metres.
         state: Number of values in the privileged state. The first ones are the proprioception.
-        places: Positions in the state that a policy can estimate from images, such as object and goal.
+        places: Points in space, such as object and goal, that the state holds and a policy can estimate from images.
         centre: Middle of the workspace in metres.
-        extra_places: Further positions, read only by a policy that gets the state.
+        extra_places: Further points in space, read only by a policy that gets the state.
         extra: Indices of further numbers in the state, read only by a policy that gets the state.
         previous: (count, index) if `state[index : index + count]` repeats the first `count` numbers of the state one
             control step earlier. A policy that gets the state reads the differences as velocities. None if the state

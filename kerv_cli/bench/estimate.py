@@ -164,7 +164,7 @@ def break_even(draft: Draft, profile: Profile, tokens: int) -> float | None:
 
 
 def sentence(engines: Sequence[dict[str, Any]], tokens: int, settings: EstimateSettings) -> str:
-    """Say how much verified drafts can speed up the first engine at most, and which two changes gain most."""
+    """State the largest speedup of verified drafts on the first engine, and the two changes that save most time."""
     best, worst = engines[0], engines[-1]
     chance = f"{sorted(settings.accepted)[len(settings.accepted) // 2]:g}"
     gains = {}

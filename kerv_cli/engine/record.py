@@ -162,7 +162,7 @@ def variability(rounds: Sequence[Round], space: ActionSpace, measure: str = MEAN
     """Return the kinematic variability K, in normalised action units: how far drafts were from the target's tokens.
 
     Strict DoFs, such as a gripper, are left out, because one wrong gripper token would outweigh all other differences.
-    None if no draft token counts, or for FAST tokens, which have no distances.
+    None if no draft token of another DoF was judged, and for FAST tokens, which have no distances.
     """
     if space.code is not None:
         return None

@@ -273,8 +273,8 @@ def _check_orders(study: Study, to_run: Mapping[Episode, object]) -> None:
 def _save_settings(connection: sa.Connection, study: Study, is_shared: bool) -> tuple[int, dict[str, int]]:
     """Write a study's row and its settings. Return the row's number, and the settings' row numbers by label.
 
-    Unless another process runs the study, stored settings that it no longer has, or that have another hash now, are
-    first deleted with their rows in WANTED. If the baseline is among them, all settings are.
+    Stored settings that the study no longer has, or whose hash changed, are first deleted with their rows in WANTED; if
+    the baseline is among them, all settings are deleted. Nothing is deleted while another process runs the study.
     """
     about = {name: getattr(study, name) for name in ABOUT}
     number = _put(connection, STUDIES, {"name": study.name}, {"kind": study.kind, "created": now(), "about": about})

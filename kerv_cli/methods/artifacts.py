@@ -108,7 +108,7 @@ class Artifact(Generic[T]):
         """Refuse a use for which the artifact lacks something. This base class allows every use."""
 
     def is_complete(self, description: T, kinds: Collection[str]) -> bool:
-        """Return whether the artifact has all that a policy with artifacts of these `kinds` needs."""
+        """Return whether the artifact holds all that a policy needs of it, if the policy has artifacts of `kinds`."""
         return True
 
     def digest(self, path: Path, description: T) -> str:

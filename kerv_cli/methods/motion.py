@@ -41,10 +41,10 @@ class MotionAcceptanceSettings:
 class MotionRule(DistanceRule):
     """Accepts a draft token if the chunk's motion is nearly the same as with the target's token.
 
-    FAST tokens stand for frequency coefficients of the chunk's motion. After the tokens accepted so far, either the
-    draft token or the target's token follows, and all missing coefficients count as zero. No action of these two
-    motions may differ by more than `tolerance`. The draft token may not give more coefficients than the target's token,
-    and may end the chunk only if the target's token ends it.
+    FAST tokens stand for frequency coefficients of the chunk's motion. Two motions are compared: that of the accepted
+    tokens and the draft token, and that of the accepted tokens and the target's token, with all missing coefficients
+    zero. They may differ by at most `tolerance` in every action. The draft token may not give more coefficients than
+    the target's token, and may end the chunk only if the target's token ends it.
     """
 
     tolerance: float

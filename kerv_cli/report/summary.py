@@ -220,7 +220,7 @@ def _parts(rows: Sequence[Cells], names: Sequence[str], width: int) -> Iterator[
 
 
 def not_in_turn(results: Sequence[Result]) -> list[str]:
-    """Return the labels of timed settings without a speedup, because no episode ran in a block with the baseline's."""
+    """Return the labels of timed settings that share no block with the baseline, so that no speedup is known."""
     apart: dict[str, None] = {}
     for row in results:
         of = row.measures

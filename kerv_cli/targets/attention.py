@@ -33,8 +33,8 @@ class Cache:
         buffer: (layers, 2, B, A, slots, C) keys and values. A fixed cache has a spare slot after its capacity.
         layers: (2, B, A, slots, C) per layer, views of the buffer.
         length: Number of cached tokens. They are in the first slots.
-        copied: Number of slots, from the first on, whose content is already in the memory that `copies` returns. It may
-            exceed `length`. Then only the first `length` slots count.
+        copied: Number of first slots that are already copied to the memory that `copies` returns. If it exceeds
+            `length`, the copies after the first `length` slots are out of date.
     """
 
     fixed = False

@@ -94,7 +94,7 @@ class BoundaryRanges:
         return float(np.quantile(alpha * radii + (1 - alpha) * lengths, quantile))
 
     def normalise(self, radius: float, length: float) -> tuple[float, float]:
-        """Scale a path's radius and length (metres) by the ranges. Return both in [0, 1].
+        """Scale a path's radius and length (metres) to [0, 1] by these ranges, and clip them.
 
         An infinite radius becomes 1 for a straight path, and 0 for a hand at rest.
         """

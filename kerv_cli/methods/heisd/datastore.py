@@ -289,10 +289,10 @@ def neighbour_tree(
     order = count()
 
     def offer(parent: int, level: int, last: int, whole: int, cost: float) -> None:
-        """Add the groups that may come next on a path to `waiting`, groups of the most similar neighbours first.
+        """Put the groups that can extend a path into `waiting`, those of the most similar neighbours first.
 
-        `last`: neighbours that have the path's last group. `whole`: neighbours that have all groups of the path since
-        it last changed to another neighbour.
+        `last`: neighbours that contain the path's final group. `whole`: neighbours that contain all its groups since
+        the path switched to another neighbour for the last time.
         """
         strict, givers = levels[level] if level < len(levels) else (False, [])
         pool = last if strict else everyone
