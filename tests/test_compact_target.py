@@ -151,7 +151,7 @@ def test_an_observation_of_another_environment_is_refused():
         seeing.encode(Observation(np.zeros(8), np.zeros(14), "insert"))
 
 
-@pytest.mark.parametrize("tokens", [1, 3, 16, 17, 33, 65])
+@pytest.mark.parametrize("tokens", [1, 3, 16, 17, 33, 65, 129])
 def test_a_padded_bucket_computes_its_tokens(tokens):
     """What a captured graph would run, call by call: the rows behind the tokens change nothing."""
     torch.manual_seed(0)
@@ -159,7 +159,7 @@ def test_a_padded_bucket_computes_its_tokens(tokens):
     x, positions = torch.randn(1, 20 + tokens, 32), torch.arange(20 + tokens)
     with torch.inference_mode():
         uncached = trunk.run_layers(x, positions, None, None, None)[:, 20:]
-        cache = trunk.new_cache(1, 90, fixed=True)
+        cache = trunk.new_cache(1, 150, fixed=True)
         assert isinstance(cache, CapturedCache)
         for first, last in ((0, 20), (20, 20 + tokens)):
             mask = attention_mask(None, last - first, cache, x)

@@ -356,6 +356,10 @@ def assert_refused(results: Path, words: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("phases", "message"),
     [
+        ({"encode": {"rows": [1], "seconds": [-0.1]}}, "impossible times of the phase 'encode'"),
+        ({"verify": {"rows": [1], "seconds": [float("nan")]}}, "impossible times of the phase 'verify'"),
+        ({"verify": {"rows": [2, 1], "seconds": [1, 1]}}, "impossible times of the phase 'verify'"),
+        ({"prefill": {"rows": [1, 2], "seconds": [1]}}, "impossible times of the phase 'prefill'"),
         ({"prefill": {"rows": [], "seconds": []}}, "has no phase 'prefill'"),
         ({"prefill": {"rows": [1], "seconds": ["x"]}}, "holds no latency profile"),
     ],

@@ -30,12 +30,13 @@ def test_the_next_write_removes_what_a_killed_one_left(tmp_path, monkeypatch):
     left = temporary_beside(tmp_path / "cell")
     left.mkdir()
     (left / "file").touch()
+    (tmp_path / ".theirs.tmp").mkdir()  # another program's
     write_json(tmp_path / "a.json", 1)
     assert left.is_dir()  # perhaps its process lives
     monkeypatch.setattr(files, "LEFT_OVER_SECONDS", -1)
     files._clean_once.cache_clear()
     write_json(tmp_path / "b.json", 1)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.json", "b.json"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".theirs.tmp", "a.json", "b.json"]
 
 
 def write(folder: Path, text: str) -> None:

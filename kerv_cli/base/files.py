@@ -13,6 +13,7 @@ import functools
 import hashlib
 import json
 import os
+import re
 import secrets
 import shutil
 import time
@@ -240,6 +241,9 @@ def _sha256(path: str, inode: int, size: int, changed: int) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+_TEMPORARY = re.compile(r"\..+\.([0-9a-f]{16}|[^/]+\.\d+-[0-9a-f]{8})\.tmp")  # the second form: before 2026-11-29
+
+
 def temporary_beside(path: Path) -> Path:
     name = path.name.encode()[:150].decode(errors="ignore")
     return path.with_name(f".{name}.{secrets.token_hex(8)}.tmp")
@@ -247,6 +251,8 @@ def temporary_beside(path: Path) -> Path:
 
 def clean(folder: Path) -> None:
     for path in folder.glob(".*.tmp"):
+        if not _TEMPORARY.fullmatch(path.name):  # of another program
+            continue
         with contextlib.suppress(OSError):  # it was renamed or removed meanwhile
             if time.time() - path.lstat().st_ctime > LEFT_OVER_SECONDS:
                 remove(path)

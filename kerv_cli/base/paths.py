@@ -21,7 +21,11 @@ RESUME = "resume.pt"
 
 def results_dir(results: str) -> Path:
     path = Path(results).expanduser()
-    if path.exists() and not path.is_dir():
+    try:
+        is_file = path.exists() and not path.is_dir()
+    except OSError as error:
+        raise UsageError(f"results={results[:80]}: {error.strerror}") from error
+    if is_file:
         raise UsageError(f"results={results} is a file: name a folder")
     return path
 

@@ -22,7 +22,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 FAMILIES = {
     "train": "Train the target or a drafter.",
     "build": "Build artifacts that need no training.",
-    "runs": "List, show, compare, export and remove runs: sweeps, rollouts, trainings, all that was made.",
+    "runs": "List, show, export and remove runs: sweeps, rollouts, trainings, all that was made.",
 }
 
 

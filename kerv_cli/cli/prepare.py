@@ -6,6 +6,7 @@ import shlex
 
 import typer
 
+from kerv_cli.base.registry import ArtifactPart
 from kerv_cli.cli.command import command
 from kerv_cli.cli.common import ShowPlan, database_of, print_table, results_word
 from kerv_cli.training.settings import PrepareSettings
@@ -42,9 +43,13 @@ def prepare(settings: PrepareSettings, overrides: list[str], plan: ShowPlan = Fa
     print_table(("what", "state", "command"), rows, name)
     run = typer.main.get_command(app).main
     if plan:
-        for step in steps:
-            if step.state != THERE:
-                run([*lines[step.kind], "--plan"], standalone_mode=False)
+        parts, made = ArtifactPart.every(), set[str]()
+        for step in (step for step in steps if step.state != THERE):
+            if made & {*parts[step.kind].needed(None)}:
+                typer.echo(f"{step.kind}: its time is known when the steps before it are done")
+            elif code := run([*lines[step.kind], "--plan"], standalone_mode=False):
+                raise typer.Exit(code)
+            made.add(step.kind)
         return
     for kind, line in lines.items():
         # planned again before each step: an artifact that was just made can make a later one outdated

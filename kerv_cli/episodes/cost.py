@@ -6,6 +6,7 @@ kind.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from operator import attrgetter
@@ -102,6 +103,10 @@ def read_profile(path: Path) -> Profile:
     if stored.get("format") != FORMAT:
         target = about.get("target", "TARGET")
         raise CheckpointError(f"{path} has another format than {FORMAT}: measure it with 'kerv bench target={target}'")
+    for kind, (rows, seconds) in phases.items():
+        increases = len(rows) == len(seconds) and list(rows) == sorted(set(rows))
+        if not increases or not all(0 <= value < math.inf for value in seconds):
+            raise CheckpointError(f"{path} has impossible times of the phase '{kind}'")
     return profile
 
 

@@ -20,7 +20,10 @@ from kerv_cli.methods.kerv.prediction import Noise
 
 FILE = "calibration.json"
 NEVER = 1.01  # s_min of a task that never skips: cosines do not exceed 1
-AGAIN = "run 'kerv calibrate replace=true' with the same policy.target= and policy.artifacts="
+AGAIN = (
+    "run 'kerv calibrate replace=true' with the same policy.target= and policy.artifacts=; for a shipped policy "
+    "policy.artifacts.calibration=NAME instead of replace=true"
+)
 
 
 @dataclass(frozen=True)

@@ -143,7 +143,7 @@ def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
     return torch.addcmul(x * cos, x.roll(x.shape[-1] // 2, -1), sin)
 
 
-SIZES = (1, 2, 4, 8, 16, 32, 64)  # numbers of tokens for which graphs are captured, at the first forward of so few
+SIZES = (1, 2, 4, 8, 16, 32, 64, 128)  # numbers of tokens for which graphs are captured, at the first forward of so few
 _WARM_UP = 3  # runs before a capture, in which libraries choose kernels and allocate workspaces
 
 # what a CUDA graph captures: `LayerStack.run_layers`
@@ -155,11 +155,11 @@ class CapturedCache(Cache):
 
     A graph takes a fixed number of tokens, its size. A forward of T tokens runs in the smallest graph that is large
     enough. The unused tokens have zeros as input. Their keys and values go to the spare slot, which no other token
-    attends to. A forward of more than 64 tokens, such as a long prompt, runs without a graph, because capturing one
+    attends to. A forward of more than 128 tokens, such as a long prompt, runs without a graph, because capturing one
     would add to the episode's time. The batch size is 1. On a CPU the same computation runs without graphs, for tests.
 
     Attributes:
-        steps: The graphs, by number of tokens. Empty before the first forward of at most 64 tokens.
+        steps: The graphs, by number of tokens. Empty before the first forward of at most 128 tokens.
     """
 
     fixed = True
@@ -177,10 +177,11 @@ class CapturedCache(Cache):
             mask: (T, slots) result of `attention_mask`.
         """
         tokens = x.shape[1]
+        # all at once, at the first forward of any size: later a capture would count in an episode's time
+        self.steps = self.steps or {size: _Step(compute, self, size, x.shape[2]) for size in SIZES}
         if tokens > SIZES[-1]:
             slots = torch.arange(self.length, self.length + tokens, device=x.device)
             return compute(x, positions, self, slots, mask)
-        self.steps = self.steps or {size: _Step(compute, self, size, x.shape[2]) for size in SIZES}
         return self.steps[1 << (tokens - 1).bit_length()].run(x, positions, mask)
 
 

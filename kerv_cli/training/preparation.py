@@ -51,8 +51,6 @@ def plan(settings: PrepareSettings, database: Database) -> list[Step]:
         if isinstance(files, TrainableDrafter) and settings.steps:
             command = (*command, f"train.steps={settings.steps}")
         state = _state(artifacts, database, kind, kinds, settings.replace)
-        if state == INCOMPLETE:
-            command = (*command, "replace=true")
         steps.append(Step(kind, state, command))
     if any(step.state != THERE for step in steps):
         demos_for(settings, description, database)
@@ -75,6 +73,7 @@ def needs(methods: tuple[str, ...]) -> tuple[str, ...]:
 
 def _state(artifacts: Artifacts, database: Database, kind: str, kinds: Sequence[str], replace: bool) -> str:
     files, path = kind_of(kind), artifacts.path(kind)
+    remedy = f"type replace=true, or name another by policy.artifacts.{kind}="
     if not artifacts.exists(kind):
         return MISSING
     try:
@@ -83,10 +82,11 @@ def _state(artifacts: Artifacts, database: Database, kind: str, kinds: Sequence[
         artifacts.check(present[: present.index(kind) + 1])
     except CheckpointError as error:
         if not replace:
-            remedy = f"type replace=true, or name another by policy.artifacts.{kind}="
             raise CheckpointError(f"{str(error).split(': ')[0]}: {remedy}") from error
         return "of other artifacts"
     if not files.is_complete(described, kinds):
+        if not replace:
+            raise CheckpointError(f"the {files.noun} in {path} lacks a part that these methods need: {remedy}")
         return INCOMPLETE
     state = artifact_entry(path, kind).state if isinstance(files, TrainableDrafter) else THERE
     if state == "complete" and command_to_go_on(database, kind, path):

@@ -88,7 +88,7 @@ class BoundaryRanges:
         if not self.points:
             raise CheckpointError(
                 "the calibration has no quantiles of F for boundary.quantile: name the limit with boundary.f_star, or "
-                "run 'kerv calibrate replace=true' for the policy"
+                "run 'kerv calibrate replace=true', or for a shipped policy with policy.artifacts.calibration=NAME"
             )
         radii, lengths = np.array(self.points).T
         return float(np.quantile(alpha * radii + (1 - alpha) * lengths, quantile))

@@ -118,7 +118,8 @@ class Predictor:
         """Return a copy that also predicts the strict DoFs, instead of holding them."""
         if self.noise is not None and not all(self.noise.q):
             raise CheckpointError(
-                "the calibration's filters were not fitted to strict DoFs: run 'kerv calibrate replace=true'"
+                "the calibration's filters were not fitted to strict DoFs: run 'kerv calibrate replace=true', or for a "
+                "shipped policy with policy.artifacts.calibration=NAME"
             )
         return type(self)(np.zeros(self.dofs, bool), self.noise, self.minimum, self.window, self.horizon)
 

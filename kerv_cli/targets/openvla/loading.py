@@ -84,6 +84,11 @@ def open_shards(folder: Path) -> Shards:
     for file in files:
         with _open_tensors(file) as handle:
             for name in handle.keys():  # noqa: SIM118 - not a mapping
+                if name in tensors:
+                    raise CheckpointError(
+                        f"{tensors[name]} and {file.name} in {folder} both hold {name}: remove the one that does not "
+                        "belong there"
+                    )
                 tensors[name], shapes[name] = file.name, tuple(handle.get_slice(name).get_shape())
     return Shards(folder, tensors, shapes)
 

@@ -42,7 +42,16 @@ VECTORS = (ACTION, EXECUTED, STATE, ENVIRONMENT)
 MOST_NUMBERS = 65_536  # in the action or the state of one control step
 OPENVLA = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
 # PIL raises SyntaxError
-_DAMAGE = (OSError, ValueError, LookupError, TypeError, AttributeError, SyntaxError, pa.ArrowException)
+_DAMAGE = (
+    OSError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    SyntaxError,
+    Image.DecompressionBombError,
+    pa.ArrowException,
+)
 
 Row: TypeAlias = Mapping[str, Any]  # of a table, or an object of a JSON file
 
