@@ -114,6 +114,15 @@ def test_a_failed_transaction_leaves_nothing(database):
     assert count(database, STUDIES) == 1
 
 
+def test_an_error_in_the_clean_up_after_an_interrupt_is_no_interrupt(database):
+    with pytest.raises((StorageError, KeyboardInterrupt), match="nowhere"):  # noqa: PT012
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            with database.writing() as connection:
+                connection.execute(sa.text("SELECT * FROM nowhere"))
+
+
 WRITERS = """
 others = []
 while len(others) < 2 and (not others or others[-1]):

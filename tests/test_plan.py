@@ -218,6 +218,27 @@ def test_an_interrupted_rerun_goes_on_without_rerun(database):
 
 
 @on_sqlite
+def test_an_interrupted_rerun_goes_on_although_the_baseline_has_changed(database):
+    """The row of a study stays what it was when it was first planned."""
+    study = threshold_study(["reach-v3"], radii=(3,))
+    store, _ = swept(database.results, study)
+    created = row_of(store).created
+    first = set(frame_of(store)["episode"])
+    with pytest.raises(Interrupted):
+        swept(database.results, study, raising(KeyboardInterrupt()), rerun="all")
+    slower = settings_of("ar")
+    slower.runtime.threads = 2
+    label = "spec_vla r=3"
+    study = study_of({"ar": slower, label: settings_of("spec_vla", 3)}, ["reach-v3"])
+    seeds = [100_000, 100_001, 100_002, 100_003]
+    assert to_run(planned(database, study))[label, "reach-v3"] == (seeds, "rerun=all")
+    store, outcome = swept(database.results, study)
+    assert (len(outcome.done), len(outcome.reused)) == (8, 0)
+    assert first.isdisjoint(frame_of(store)["episode"])
+    assert row_of(store).created == created
+
+
+@on_sqlite
 def test_reasons_name_what_changed(database, monkeypatch):
     swept(database.results, threshold_study(["reach-v3"]))
 

@@ -13,7 +13,7 @@ from conftest import python, refused, write_policy
 from kerv_cli.base.errors import UsageError
 from kerv_cli.episodes.runner import Runner
 from kerv_cli.lab.database import opened
-from kerv_cli.lab.runs import Presence, Run, bury, living
+from kerv_cli.lab.runs import Presence, Run, bury, living, run_rows
 from kerv_cli.lab.store import Study, frame_of
 
 STUDY = """
@@ -101,6 +101,19 @@ def test_a_killed_process_of_this_machine_is_known_at_once(tmp_path):
         assert len(list((tmp_path / ".workers").iterdir())) == 2
     bury(database)
     assert not list((tmp_path / ".workers").iterdir())
+
+
+def test_a_command_that_cannot_make_its_lock_leaves_no_row(tmp_path):
+    database, folder = opened(tmp_path), tmp_path / ".workers"
+    folder.write_text("")  # in the way of the folder of locks
+    with pytest.raises(FileExistsError), Run(database, "target", "mine", ["train"]):
+        pass
+    assert run_rows(database) == []
+    folder.unlink()
+    with Run(database, "target", "mine", ["train"]):
+        with refused("is being made", error=UsageError), Run(database, "target", "mine", ["train"]):
+            pass
+        assert len(list(folder.iterdir())) == 1
 
 
 def test_an_interrupt_in_a_transaction_frees_its_lock_before_the_heart_is_awaited(tmp_path, monkeypatch):

@@ -10,6 +10,7 @@ import contextlib
 import functools
 import json
 import sqlite3
+import sys
 import threading
 from collections.abc import Iterator
 from datetime import UTC, datetime
@@ -255,10 +256,12 @@ class Database:
 
     @contextlib.contextmanager
     def _errors(self) -> Iterator[None]:
+        before = sys.exception()
         try:
             yield
         except sa.exc.DBAPIError as error:
-            if is_of_an_interrupt(error):  # the driver could not roll back what Ctrl-C has left
+            # the driver could not roll back what Ctrl-C has left; an error in the clean-up after Ctrl-C is another
+            if is_of_an_interrupt(error) and not is_of_an_interrupt(before):
                 raise KeyboardInterrupt from error
             raise self._explained(error) from error
         except (Damaged, json.JSONDecodeError, UnicodeDecodeError) as error:

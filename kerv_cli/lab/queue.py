@@ -122,10 +122,11 @@ class Queue:
         episode = SETTINGS.c.work, WANTED.c.task, WANTED.c.seed
         query = sa.select(*episode).select_from(PLANNED).where(WANTED.c.worker.in_(others), UNFINISHED)
         query = query.where(STUDIES.c.kind != ROLLOUT, STUDIES.c.id != self.number)
-        held = list(map(tuple, connection.execute(query)))
-        if not held or self.study.kind == ROLLOUT:  # rollouts share no episodes with other studies
+        # rollouts share no episodes with other studies
+        if self.study.kind == ROLLOUT or connection.execute(query.limit(1)).first() is None:
             return []
-        mine = sa.select(WANTED.c.block).select_from(PLANNED).where(self._of_study, sa.tuple_(*episode).in_(held))
+        is_held = sa.tuple_(*episode).in_(query.correlate(None))  # a list might have more values than SQL may bind
+        mine = sa.select(WANTED.c.block).distinct().select_from(PLANNED).where(self._of_study, is_held)
         return connection.scalars(mine).all()
 
     def _settings_of(self, connection: sa.Connection, rows: Sequence[Any]) -> Mapping[int, Setting]:

@@ -126,9 +126,13 @@ class Presence:
         self._heart = threading.Thread(target=self._keep_beating, daemon=True)
 
     def __enter__(self) -> Self:
-        with self.database.writing() as connection:
-            self._begin_in(connection)
-        self._lock = _lock(_lock_of(self.database, self.worker))
+        self._lock = _lock(_lock_of(self.database, self.worker))  # before others can read the name
+        try:
+            with self.database.writing() as connection:
+                self._begin_in(connection)
+        except BaseException:
+            self._unlock()
+            raise
         self._heart.start()
         return self
 
@@ -136,6 +140,10 @@ class Presence:
         forgotten = WORKERS.c.heartbeat < clock(connection) - _FORGET_SECONDS
         connection.execute(sa.delete(WORKERS).where(forgotten))
         self.beat_in(connection)
+
+    def _unlock(self) -> None:
+        os.close(self._lock)
+        _lock_of(self.database, self.worker).unlink(missing_ok=True)
 
     def beat_in(self, connection: sa.Connection) -> None:
         """Write a heartbeat, in the open transaction of `connection`."""
@@ -162,8 +170,7 @@ class Presence:
         with contextlib.suppress(StorageError), self.database.writing() as connection:
             connection.execute(sa.update(WANTED).where(mine, UNFINISHED).values(worker=None, attempts=0))
             connection.execute(sa.delete(WORKERS).where(WORKERS.c.name == self.worker))
-        os.close(self._lock)
-        _lock_of(self.database, self.worker).unlink(missing_ok=True)
+        self._unlock()
 
 
 _SEEN = sa.select(sa.func.max(WORKERS.c.heartbeat)).where(WORKERS.c.run == RUNS.c.id).scalar_subquery()

@@ -22,7 +22,7 @@ from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.episodes import policy
 from kerv_cli.episodes.identity import Setting
 from kerv_cli.episodes.resolve import ResolvedStudy, located
-from kerv_cli.lab.database import EPISODES, RUNS, SETTINGS, STUDIES, UNFINISHED, WANTED, Database, now
+from kerv_cli.lab.database import EPISODES, PLANNED, RUNS, SETTINGS, STUDIES, UNFINISHED, WANTED, Database, now
 from kerv_cli.lab.plan import ALL, NEVER, Block, Episode, all_episodes, blocks_of, ordered_parts, split
 from kerv_cli.lab.runs import interrupted, living
 from kerv_cli.lab.store import ABOUT, SWEEP, Study, counts_of, row_of, rows_of, setting_of, stored_episodes, swept_by
@@ -186,6 +186,9 @@ def save(plan: Plan, run: str = "") -> None:
         claimed = claimed.where(STUDIES.c.name == study.name, UNFINISHED, WANTED.c.worker.in_(alive))
         others = sa.or_(_other_commands(study, alive, run), claimed.exists())
         is_shared = bool(connection.scalar(sa.select(others)))
+        flagged = sa.select(SETTINGS.c.label, SETTINGS.c.work, WANTED.c.task, WANTED.c.seed).select_from(PLANNED)
+        flagged = flagged.where(STUDIES.c.name == study.name, WANTED.c.anew)
+        anew = set(map(tuple, connection.execute(flagged)))  # before `_save_settings`, which can delete the rows
         number, ids = _save_settings(connection, study, is_shared)
         before = {_key(row): _values(row) for row in rows_of(connection, study.name)}
         wanted = {(ids[one.setting.label], one.task, one.seed): one for one in study.episodes}
@@ -205,7 +208,7 @@ def save(plan: Plan, run: str = "") -> None:
                 continue
             after[key] = dict(zip(_KEY, key, strict=True)) | {
                 "study_id": number, "position": position, "episode_id": linked if linked in stored else None,
-                "error": None, **_NOBODYS, "anew": plan.anew or (row is not None and row["anew"]),
+                "error": None, **_NOBODYS, "anew": plan.anew or (one.setting.label, *one.key) in anew,
             }  # fmt: skip
             if after[key]["episode_id"] is None:
                 to_run[one] = after[key]
@@ -277,7 +280,7 @@ def _save_settings(connection: sa.Connection, study: Study, is_shared: bool) -> 
     the baseline is among them, all settings are deleted. Nothing is deleted while another process runs the study.
     """
     about = {name: getattr(study, name) for name in ABOUT}
-    number = _put(connection, STUDIES, {"name": study.name}, {"kind": study.kind, "created": now(), "about": about})
+    number = _put(connection, STUDIES, {"name": study.name}, {"about": about}, kind=study.kind, created=now())
     stored = sa.select(SETTINGS.c.label, SETTINGS.c.work).where(SETTINGS.c.study_id == number)
     works: dict[str, str] = dict(connection.execute(stored).all())
     if not is_shared:
@@ -305,10 +308,12 @@ def _save_settings(connection: sa.Connection, study: Study, is_shared: bool) -> 
     return number, ids
 
 
-def _put(connection: sa.Connection, table: sa.Table, key: Mapping[str, Any], values: Mapping[str, Any]) -> int:
-    """Change the row with this key, or insert one. Return its number."""
+def _put(
+    connection: sa.Connection, table: sa.Table, key: Mapping[str, Any], values: Mapping[str, Any], **first: Any
+) -> int:
+    """Change the row with this key, or insert one that also has the values `first`. Return its number."""
     changed = sa.update(table).filter_by(**key).values(**values).returning(table.c.id)
-    new = sa.insert(table).values(**key, **values).returning(table.c.id)
+    new = sa.insert(table).values(**key, **values, **first).returning(table.c.id)
     return int(connection.scalar(changed) or connection.scalar(new))
 
 
