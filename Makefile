@@ -29,8 +29,8 @@ test: lint ## check style, types and imports, then run the tests
 test-cpus: setup ## run the tests of equal bits and tokens under four kinds of CPU kernels
 	@$(BIN)/python scripts/cpus.py $(PARALLEL)
 
-demo: setup ## README's table in small: six settings, one task, about two minutes
-	@echo "README's table in small: six settings decode the same three episodes in turn, about two minutes on one core"
+demo: setup ## README's table in small: six settings, one task, about three minutes
+	@echo "README's table in small: six settings decode the same three episodes in turn, about three minutes on one core"
 	@$(BIN)/kerv build target grow=60m policy.target=mt10-vision name=mt10-60m > /dev/null
 	@$(BIN)/kerv sweep study=demo
 
