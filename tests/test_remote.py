@@ -151,7 +151,8 @@ def test_the_client_adds_at_most_two_milliseconds_to_an_answer():
         decoder.reset("reach-v3", 0, np.zeros(3))
         seen = Observation(np.zeros(4), np.zeros(39), "reach", {"corner2": image})
         records = [decoder.decode(seen) for _ in range(50)]
-    assert min(one.seconds - one.served.seconds for one in records) < 0.002  # a busy machine delays most of them
+    added = np.reshape([one.seconds - one.served.seconds for one in records], (5, 10))
+    assert np.median(added, 1).min() < 0.002  # in the quietest tenth of a second, because others use this machine, too
     assert [one.actions.shape for one in records] == [(4, 4)] * 50
 
 
