@@ -246,6 +246,12 @@ class Chunk:
         self.filled |= dict(enumerate(values.flatten()[start:].tolist(), start))
         self.tokens += self.space.bins_of(values).flatten()[start:].tolist()
 
+    def history(self) -> np.ndarray:
+        """Return `Follower.history` as if this chunk's complete control steps were executed. FAST tokens: none is."""
+        whole = 0 if self.space.code else len(self.tokens) // self.dofs
+        decided = self.space.values_of(np.array(self.tokens[: whole * self.dofs], dtype=np.int64))
+        return self.episode.history(decided.reshape(whole, self.dofs))
+
     def actions(self) -> np.ndarray:
         """Return the chunk's actions (S, D), float32, environment units. S < `steps` if a rectifier ended the chunk."""
         return self.space.unnormalise(self.values(self.steps)).astype(np.float32)

@@ -53,9 +53,8 @@ class NearProposer(Proposer):
 
         space, dofs, committed = chunk.space, chunk.space.dofs, len(chunk.tokens)
         done = committed // dofs
-        decided = space.values_of(np.array(chunk.tokens[: done * dofs], dtype=np.int64)).reshape(done, dofs)
         planned = space.bins_of(np.array(chunk.episode.planned[done : chunk.steps]).reshape(-1, dofs))
-        past = space.bins_of(chunk.episode.history(decided))
+        past = space.bins_of(chunk.history())
         if not len(past):
             past = planned[:1]
         if not len(past):

@@ -98,8 +98,7 @@ class LastActionProposer(ChainProposer):
         space, episode = chunk.space, chunk.episode
         steps = space.code.steps if space.code else chunk.steps
         done = 0 if space.code else len(chunk.tokens) // space.dofs
-        known = space.values_of(np.array(chunk.tokens[: done * space.dofs], dtype=np.int64)).reshape(done, space.dofs)
-        past = episode.history(known)
+        past = chunk.history()
         ahead = episode.planned[done:steps]
         if not ahead and not len(past):
             return []

@@ -202,8 +202,7 @@ class PredictionProposer(ChainProposer):
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
         whole = len(chunk.tokens) // chunk.dofs
-        pending = np.array(chunk.tokens[: whole * chunk.dofs], dtype=np.int64).reshape(whole, chunk.dofs)
-        history = chunk.episode.history(chunk.space.values_of(pending))
+        history = chunk.history()
         predicted = self.predictor.predict(history, chunk.steps - whole)
         if predicted is None:
             return []
