@@ -204,7 +204,7 @@ class ExpertDecoder(Follower):
     """Returns one action at a time from the environment's scripted controller of a task.
 
     The controller reads the privileged simulator state, as policies with `observation=state` do. A record has no
-    forwards, rounds or tokens, and its time is not compared with that of a decoding method.
+    forwards, rounds or tokens, and its time says nothing about decoding.
     """
 
     def __init__(self, task: str) -> None:

@@ -230,8 +230,7 @@ class RemoteDecoder(Follower):
     def decode(self, observation: Observation) -> DecodeRecord:
         """Return a record with the server's actions. Its `seconds` are the time from the observation to the actions.
 
-        If the connection was lost meanwhile, the server begins the episode anew, and `seconds` are those of the last
-        attempt.
+        If the connection broke, the server begins the episode anew, and `seconds` counts from the last request on.
         """
         for _ in range(self._asks):
             began, answer = self._answered(observation)

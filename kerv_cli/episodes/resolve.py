@@ -43,7 +43,7 @@ class Point:
     overrides: tuple[str, ...]  # this point's overrides, `key=value`
     # this point's values for the keys that differ within the grid, by key
     varies: Mapping[str, str] = field(default_factory=dict)
-    # all overrides from which the setting is composed, those of the study and the command line included
+    # all overrides that make the setting: the study's and those of the command line
     words: tuple[str, ...] = ()
 
     @classmethod
@@ -154,7 +154,7 @@ def _points(study: StudySettings, path: Path, typed: Collection[str]) -> dict[st
 def _line_of(path: Path, typed: Collection[str], place: str, others: Mapping[str, str] = {}) -> Iterator[None]:
     """Prefix a UsageError with the study's file and a line, unless the user typed the wrong key (`typed`).
 
-    The line is that of the key `others[error.key]`, else of `place`.
+    It is the line of the key `others[error.key]` in that file, or of `place` if `others` lacks the key.
     """
     try:
         yield

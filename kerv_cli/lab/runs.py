@@ -345,7 +345,7 @@ def command_to_go_on(database: Database, kind: str, folder: Path) -> tuple[str, 
 
 
 def interrupted(database: Database, kind: str, command: Sequence[str]) -> str:
-    """Return the name of what a command's newest run was making. Empty if that run completed, or if there is none."""
+    """Return the name of what a command's newest run left unfinished. Empty if that run completed or never began."""
     row = next((row for row in run_rows(database, kind) if row.command == list(command)), None)
     return "" if row is None or row.status == COMPLETE else str(row.name)
 
