@@ -10,6 +10,7 @@ import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from kerv_cli.base.files import own_folder
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
 from kerv_cli.engine.decisions import ROOT, TokenTree
 from kerv_cli.engine.draft import HOST, Draft
@@ -19,7 +20,7 @@ from kerv_cli.methods.early.drafter import choose
 from kerv_cli.targets.checkpoint import compact, expanded
 from kerv_cli.targets.compact import program
 from kerv_cli.targets.compact.features import WordTokenizer
-from kerv_cli.targets.compact.program import Program, compile_parts, kernels, multiplies_bfloat16, own_folder
+from kerv_cli.targets.compact.program import Program, compile_parts, kernels, multiplies_bfloat16
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.compact.trunk import Trunk
 from kerv_cli.targets.settings import TargetSettings

@@ -5,6 +5,7 @@ import json
 import math
 import operator
 import re
+import resource
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +29,7 @@ from kerv_cli.lab.plan import Episode
 from kerv_cli.lab.store import Study
 from kerv_cli.lab.study import save
 from kerv_cli.lab.work import RunEpisode
+from kerv_cli.report import plots
 from kerv_cli.report.measures import Result
 from kerv_cli.report.plots import acceptance_figure, colours_of, curves_figure, lines_of, png, study_figures
 from kerv_cli.report.report import CSV_COLUMNS, Report, further_of, render, report
@@ -519,3 +521,25 @@ def test_a_trainings_curves_mark_the_best_validation():
     assert [panel["title"] for panel in panels] == ["validation score (the best is kept)", "loss"]
     assert [panel["layer"][0]["encoding"]["x"]["datum"] for panel in panels] == [20.0, 20.0]
     assert png(figure, "a", "b") == png(figure, "a", "b")
+
+
+def test_the_javascript_of_a_page_is_made_once_on_a_machine(tmp_path, monkeypatch):
+    made = iter(["first", "second", "third"])
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr("vl_convert.javascript_bundle", lambda: next(made))
+    library = plots.library.__wrapped__  # as in a process of its own
+    assert [library(), library()] == ["first", "first"]
+    monkeypatch.setattr("kerv_cli.report.plots.version", lambda package: "another")
+    assert library() == "second"
+
+
+def test_a_page_is_made_though_its_javascript_cannot_be_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr("vl_convert.javascript_bundle", lambda: "made")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))  # as on a full disk
+    try:
+        assert plots.library.__wrapped__() == "made"
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]

@@ -16,6 +16,8 @@ import os
 import re
 import secrets
 import shutil
+import stat
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -135,6 +137,17 @@ def link_files(folder: Path, new: Path) -> None:
 
     temporary = shutil.ignore_patterns(".*.tmp")
     shutil.copytree(folder, new, symlinks=True, ignore=temporary, copy_function=link, dirs_exist_ok=True)
+
+
+def own_folder() -> Path:
+    """Return a temporary folder of this user that no other user can write, so that code in it may be trusted."""
+    folder = Path(tempfile.gettempdir(), f"kerv-{os.getuid()}")
+    with contextlib.suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    status = folder.lstat()
+    if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o022:
+        return folder
+    return Path(tempfile.mkdtemp(prefix="kerv-"))
 
 
 def visible(folder: Path) -> list[Path]:

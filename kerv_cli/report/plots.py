@@ -6,10 +6,12 @@ chart's parameter `picked` to the setting's label.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from importlib.metadata import version
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,8 +22,8 @@ import pandas as pd
 import vl_convert
 
 from kerv_cli.base.durations import count
-from kerv_cli.base.errors import CheckpointError
-from kerv_cli.base.files import write_if_changed
+from kerv_cli.base.errors import CheckpointError, StorageError
+from kerv_cli.base.files import own_folder, write_if_changed, write_text
 from kerv_cli.report.measures import Result, is_number
 from kerv_cli.report.summary import MAIN, summary
 from kerv_cli.report.tables import NO_STRESS, StudyData, dof_names
@@ -291,7 +293,14 @@ def png(figure: alt.ConcatChart, title: str, subtitle: str) -> bytes:
 
 @functools.cache
 def library() -> str:
-    return str(vl_convert.javascript_bundle())  # type: ignore[call-arg]  # its stub forgets that it has a default
+    """Return the page's JavaScript. Making it takes three seconds, so later processes read it from a file."""
+    path = own_folder() / f"vega-{version('vl-convert-python')}.js"
+    with contextlib.suppress(OSError):
+        return path.read_text(encoding="utf-8")
+    bundle = str(vl_convert.javascript_bundle())  # type: ignore[call-arg]  # its stub forgets that it has a default
+    with contextlib.suppress(StorageError):
+        write_text(path, bundle)
+    return bundle
 
 
 def read_log(folder: Path) -> pd.DataFrame:

@@ -11,13 +11,9 @@ written either, kerv chooses a temporary folder that only this user can write.
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import functools
 import logging
-import os
-import stat
-import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -29,6 +25,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.weak import WeakIdKeyDictionary
 
+from kerv_cli.base.files import own_folder
 from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.checkpoint import load_state
 from kerv_cli.targets.compact.recording import ARGMAX, BFLOAT, BLOCKED, BRANCH, COLUMNS, FLOAT, HALF, INT8, PANEL, Tape
@@ -36,17 +33,6 @@ from kerv_cli.targets.compact.recording import ARGMAX, BFLOAT, BLOCKED, BRANCH, 
 _LOG = logging.getLogger("kerv")
 LARGE = 2**19  # weights of a bfloat16 matrix from which on oneDNN's layout saves more than a call of oneDNN costs
 ROWS = 32  # oneDNN chooses the layout for this many rows; 154 M weights take 27 ms for 1 row, 33 for 31, 41 for 47
-
-
-def own_folder() -> Path:
-    """Return a temporary folder of this user that no other user can write, so that running the code in it is safe."""
-    folder = Path(tempfile.gettempdir(), f"kerv-{os.getuid()}")
-    with contextlib.suppress(FileExistsError):
-        folder.mkdir(mode=0o700)
-    status = folder.lstat()
-    if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o022:
-        return folder
-    return Path(tempfile.mkdtemp(prefix="kerv-"))
 
 
 @functools.lru_cache(maxsize=1)
