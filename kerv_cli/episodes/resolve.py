@@ -43,7 +43,7 @@ class Point:
     overrides: tuple[str, ...]  # this point's overrides, `key=value`
     # this point's values for the keys that differ within the grid, by key
     varies: Mapping[str, str] = field(default_factory=dict)
-    # all overrides that make the setting: the study's and those of the command line
+    # all overrides of the setting: the study file's and the command line's
     words: tuple[str, ...] = ()
 
     @classmethod

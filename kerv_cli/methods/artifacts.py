@@ -24,6 +24,10 @@ from kerv_cli.targets import checkpoint
 from kerv_cli.targets.checkpoint import TargetDescription
 
 TARGET = "target"
+AGAIN = (  # how to measure a calibration again
+    "run 'kerv calibrate replace=true' with the same policy.target= and policy.artifacts=; for a shipped policy "
+    "policy.artifacts.calibration=NAME instead of replace=true"
+)
 
 
 T = TypeVar("T")

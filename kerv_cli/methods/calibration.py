@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.engine.record import MEAN
-from kerv_cli.methods.artifacts import Artifact, MadeFor, Use, check_sources
+from kerv_cli.methods.artifacts import AGAIN, Artifact, MadeFor, Use, check_sources
 from kerv_cli.methods.heisd import FusedBoundarySettings
 from kerv_cli.methods.heisd.curvature import BoundaryRanges
 from kerv_cli.methods.kerv import KinematicThresholdSettings
@@ -20,10 +20,6 @@ from kerv_cli.methods.kerv.prediction import Noise
 
 FILE = "calibration.json"
 NEVER = 1.01  # s_min of a task that never skips: cosines do not exceed 1
-AGAIN = (
-    "run 'kerv calibrate replace=true' with the same policy.target= and policy.artifacts=; for a shipped policy "
-    "policy.artifacts.calibration=NAME instead of replace=true"
-)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import numpy as np
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.engine.record import path_length
+from kerv_cli.methods.artifacts import AGAIN
 from kerv_cli.methods.heisd import LEAST
 
 POINTS = 100  # number of windows of the demonstrations that a calibration keeps
@@ -87,8 +88,8 @@ class BoundaryRanges:
         """Return the limit F*: a quantile of F over the windows of the demonstrations."""
         if not self.points:
             raise CheckpointError(
-                "the calibration has no quantiles of F for boundary.quantile: name the limit with boundary.f_star, or "
-                "run 'kerv calibrate replace=true', or for a shipped policy with policy.artifacts.calibration=NAME"
+                "the calibration has no quantiles of F for boundary.quantile: name the limit with boundary.f_star, "
+                f"or {AGAIN}"
             )
         radii, lengths = np.array(self.points).T
         return float(np.quantile(alpha * radii + (1 - alpha) * lengths, quantile))

@@ -18,6 +18,7 @@ import numpy as np
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.engine.chunk import WINDOW
 from kerv_cli.engine.proposer import ChainProposer
+from kerv_cli.methods.artifacts import AGAIN
 
 if TYPE_CHECKING:
     from kerv_cli.engine.chunk import Chunk
@@ -117,10 +118,7 @@ class Predictor:
     def released(self) -> Self:
         """Return a copy that also predicts the strict DoFs, instead of holding them."""
         if self.noise is not None and not all(self.noise.q):
-            raise CheckpointError(
-                "the calibration's filters were not fitted to strict DoFs: run 'kerv calibrate replace=true', or for a "
-                "shipped policy with policy.artifacts.calibration=NAME"
-            )
+            raise CheckpointError(f"the calibration's filters were not fitted to strict DoFs: {AGAIN}")
         return type(self)(np.zeros(self.dofs, bool), self.noise, self.minimum, self.window, self.horizon)
 
     def predict(self, history: np.ndarray, steps: int) -> np.ndarray | None:
