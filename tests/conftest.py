@@ -39,7 +39,7 @@ ENVIRONMENTS = dict(registry.parts("environment"))
 LONGEST = (
     *("test_execute", "test_cli", "test_packaging", "test_golden", "test_studies_tables", "test_proposers"),
     *("test_prepare", "test_program", "test_lerobot", "test_runs", "test_training", "test_board", "test_stress"),
-    *("test_database", "test_batched", "test_plan", "test_documented_commands", "test_reprice", "test_calibration"),
+    *("test_database", "test_plan", "test_documented_commands", "test_reprice", "test_calibration"),
     *("test_extending", "test_views", "test_vla_eval", "test_api", "test_sim_demos", "test_sim_world"),
 )
 """Files that take longest, begun first: no process is left with one of them at the end while the others idle."""

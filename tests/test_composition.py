@@ -136,10 +136,6 @@ def test_only_what_needs_no_states_can_be_chosen_before_the_prefill():
         ("policy=parallel method=ar", "use method=parallel"),
         ("policy=parallel method=parallel proposer=jacobi", "proposer=jacobi: nothing is drafted"),
         ("policy=parallel method=parallel deviation_every=2", "no AR to differ from"),
-        ("policy=state rollout.batch=8 method=spec_vla", "method=spec_vla"),
-        ("policy=state rollout.batch=8 method=early_unverified threshold=schedule", "threshold=schedule"),
-        ("policy=state rollout.batch=8 rollout.clock=real", "rollout.clock=real"),
-        ("policy=state rollout.batch=8 deviation_every=2", "deviation_every=2"),
         (
             "policy=vision world.camera.name=topview",
             "camera.name=topview: mt10-vision sees corner4, leave it out",

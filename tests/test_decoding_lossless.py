@@ -19,7 +19,7 @@ from kerv_cli.base.errors import KervError
 from kerv_cli.base.spaces import ActionSpace, Observation
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decisions import ROOT
-from kerv_cli.engine.decoder import BatchDecoder, Decoder, Parts
+from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import Target
@@ -359,17 +359,14 @@ def test_last_action_drafts_the_rest_of_the_last_chunk_then_its_last_action():
         decoder.observe(SEVEN.decode(rows[min(executed, 3)]), np.zeros(3))
 
 
-def test_a_chunk_ends_at_its_end_token_and_a_batch_decodes_the_same():
+def test_a_chunk_ends_at_its_end_token():
     """The record's size is the largest number of tokens, and actions are complete."""
     space = dataclasses.replace(SEVEN, code=short_code(2, SEVEN.dofs))
     target, lengths = MockTarget(space, 2, seed=3), set()
     decoder = Decoder(target)
-    batch = BatchDecoder(Decoder(target))
     for number in range(12):
         shown = Observation(np.array([0.1 * number]), np.zeros(0), "word " * (1 + number % 3))
         record = decoder.decode(shown)
-        (together,) = batch.decode([batch.new_episode()], [shown])
-        assert together.tokens == record.tokens
         assert record.actions.shape == (2, 7)
         assert (record.size, len(record.tokens)) == (space.longest(2), record.forwards)
         assert space.end not in record.tokens[:-1]

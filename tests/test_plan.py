@@ -81,6 +81,12 @@ def test_what_determines_a_result_is_another_episode():
         assert work(changed(path, value)) == work(settings_of("spec_vla", 9)), path
 
 
+def test_stored_settings_that_have_left_are_passed_over():
+    (setting, *_) = threshold_study(["reach-v3"]).settings
+    plain = {**setting.settings, "rollout": {**setting.settings["rollout"], "batch": 4, "ar_ms": 5.0}}
+    assert dataclasses.replace(setting, settings=plain).on("reach-v3") == setting.on("reach-v3")
+
+
 def test_weights_and_engine_are_part_of_the_meaning(monkeypatch):
     settings = settings_of("ar")
     assert work(settings, {**IDENTITY, "drafter": "c" * 64}) != work(settings)

@@ -348,7 +348,7 @@ def test_a_slow_server_is_waited_for_in_sight(tmp_path, monkeypatch):
     ("typed", "says"),
     [
         (["method=kerv"], "method=kerv with policy=remote: the server decides it"),
-        (["rollout.batch=2"], "policy=remote with rollout.batch=2: the server decides it"),
+        (["chunk=2"], "policy=remote with chunk=2: the server decides it"),
         (["policy.url=http://x"], "write policy.url=ws://HOST:PORT"),
         (["policy.interface=openpi"], "did you mean openpi_libero"),
         (["policy.interface=openpi_libero"], "the server's policy is for libero, these tasks are of point-mass"),

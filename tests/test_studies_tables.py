@@ -18,9 +18,19 @@ import sqlalchemy as sa
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
-from studies_synthetic import part, planned, points_of, settings_of, still_episode, study_of, swept, threshold_study
+from studies_synthetic import (
+    episode,
+    part,
+    planned,
+    points_of,
+    settings_of,
+    still_episode,
+    study_of,
+    swept,
+    threshold_study,
+)
 
-from kerv_cli.engine.record import DecodeRecord, Round
+from kerv_cli.engine.record import PHASES, DecodeRecord, Round
 from kerv_cli.episodes.identity import Setting
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab import database as tables
@@ -211,6 +221,31 @@ def test_failures_near_the_object_are_a_share_of_the_failures(data):
     assert shares["push-v3", "kerv"] == 0.5  # it failed at 0.015 m and at 0.03 m
     assert shares["push-v3", "ar"] == 0.0
     assert math.isnan(shares["reach-v3", "kerv"])  # nothing failed
+
+
+@pytest.mark.parametrize("untimed", [["ar"], ["naive_sd", "spec_vla r=3", "spec_vla r=9"]])
+def test_no_speedup_is_made_of_what_was_not_timed(tmp_path, untimed):
+    """Databases of earlier versions hold episodes that were decoded in batches, without times."""
+
+    def prepare(setting: Setting, task: str) -> RunEpisode:
+        def run(seed: int) -> Any:
+            record = episode(setting, task, seed)
+            if setting.label not in untimed:
+                return record
+            none = [replace(one, seconds=math.nan, phases=dict.fromkeys(PHASES, math.nan)) for one in record.decodes]
+            return replace(record, decodes=tuple(none))
+
+        return run
+
+    store, _ = swept(tmp_path, threshold_study(["reach-v3"], 2), prepare)
+    data = load_study(store)
+    table = pd.DataFrame([row.columns() for row in data.results]).set_index("label")
+    assert table.drop(index="ar")[["speedup", "speedup_low", "episode_speedup"]].isna().all(axis=None)
+    assert table["time_per_step_ms"].isna().to_dict() == {label: label in untimed for label in table.index}
+    assert table["success"].notna().all()
+    printed = {row["setting"]: row["speed, per episode"] for row in summary(data.results)}
+    assert printed == {label: "1×" if label == "ar" and label not in untimed else "–" for label in table.index}
+    assert study_figures(data.results, "threshold.r")
 
 
 def test_the_baseline_has_no_verifications_and_a_speedup_of_one(data):

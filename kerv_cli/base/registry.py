@@ -235,13 +235,11 @@ class ThresholdPart(Part):
     """A registered threshold: the rule that chooses the acceptance radius r of each decode.
 
     Args:
-        batchable: Whether the part works for several episodes at once.
         radius: Name of the setting with the largest radius, such as `r_max`. A radius that is larger than the largest
             distance between two tokens is refused. Empty if there is no such setting.
     """
 
     kind = "threshold"
-    batchable: bool = False
     radius: str = ""
 
 
@@ -271,14 +269,12 @@ class SkipPart(Part):
         takes_draft: Whether the rule can execute the prefill draft.
         merges: Whether the prefill draft may be merged from several proposers.
         verifies: Whether it ever lets the target verify a draft.
-        batchable: Whether the part works for several episodes at once.
     """
 
     kind = "skip"
     takes_draft: bool = False
     merges: bool = False
     verifies: bool = True
-    batchable: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -165,7 +165,7 @@ def _say_what_begins(left: TimeLeft) -> int:
     from kerv_cli.lab.work import load_per_core
 
     plan, load = left.plan, load_per_core()
-    if load > BUSY and any(block.batch == 1 for block in plan.blocks):
+    if load > BUSY and plan.blocks:
         typer.echo(f"the load average is {load:g} per core: other programs slow these times", err=True)
     total, reused = len(plan.to_run), len(plan.existing)
     there = f"{count(reused, 'episode')} there already" if reused else ""

@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import functools
 import itertools
-import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -24,8 +23,8 @@ from kerv_cli.engine.decisions import Judged, TokenTree
 from kerv_cli.engine.draft import EMPTY, Draft, read, upload
 from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold
 from kerv_cli.engine.proposer import Proposer
-from kerv_cli.engine.protocol import Cache, ContinuesGreedily, EncodesMany, PredictsTokens, Target
-from kerv_cli.engine.record import MEAN, PHASES, UNTIMED, DecodeRecord, Round, variability
+from kerv_cli.engine.protocol import Cache, ContinuesGreedily, PredictsTokens, Target
+from kerv_cli.engine.record import MEAN, PHASES, DecodeRecord, Round, variability
 
 
 class Stopwatch:
@@ -343,61 +342,6 @@ class Decoder(Follower):
             hidden = torch.cat([hidden, self.commit(chunk, self.verify(chunk, EMPTY), Accepted((), None), None)], 1)
             stopwatch.lap("verify")
         return hidden
-
-
-class BatchDecoder:
-    """Decodes one chunk for each of several episodes, with the target and the method of a decoder.
-
-    In float32 it decodes the same tokens as `Decoder`, unless two logits are equal up to rounding. The records have no
-    times.
-    """
-
-    def __init__(self, decoder: Decoder) -> None:
-        self.decoder, self.target = decoder, decoder.target
-        self.limits = decoder.acceptance.limits(decoder.threshold.radius())
-        self.skip, self.size = decoder.parts.skip, decoder.target.actions.longest(decoder.steps)
-        self._caches: dict[int, Cache] = {}
-
-    def new_episode(self) -> Follower:
-        return Follower(self.target.actions, self.target.cameras)
-
-    @torch.inference_mode()
-    def decode(self, episodes: Sequence[Follower], observations: Sequence[Observation]) -> list[DecodeRecord]:
-        prompts = functools.cache(lambda: self._encode(observations))  # encoded only if some part reads a prompt
-        steps, space, cache = self.decoder.steps, self.target.actions, self.decoder.cache
-        chunks = []
-        for i, episode in enumerate(episodes):
-            target = TargetSide(lambda i=i: prompts()[i], cache)  # type: ignore[misc]
-            chunk = Chunk(steps, space, episode, target, self.limits)
-            if self.skip is not None:
-                cache.length = 0
-                chunk.take(self.skip.take(chunk))
-            chunks.append(chunk)
-        groups: dict[int, list[Chunk]] = {}  # chunks with equally long prompts are decoded together, unpadded
-        for chunk in chunks:
-            if chunk.remaining:
-                groups.setdefault(chunk.target.prompt_length, []).append(chunk)
-        for group in groups.values():
-            prompt = torch.cat([chunk.target.prompt for chunk in group])
-            decoded, _ = greedy(self.target, prompt, self._cache(len(group)), self.size)
-            for chunk, tokens in zip(group, decoded.tolist(), strict=True):
-                for token in chunk.until_end(tokens):
-                    chunk.commit_token(token)
-        for chunk in chunks:
-            chunk.episode.last = chunk.tokens
-        return [chunk.record(chunk.actions(), math.nan, dict(UNTIMED)) for chunk in chunks]
-
-    def _encode(self, observations: Sequence[Observation]) -> list[Tensor]:
-        # on a CPU one by one, because kerv's compiled encoders are faster that way; each is (1, P, E)
-        if isinstance(self.target, EncodesMany) and self.target.device.type != "cpu":
-            return list(self.target.encode_many(observations).split(1))
-        return list(map(self.target.encode, observations))
-
-    def _cache(self, rows: int) -> Cache:
-        if rows not in self._caches:  # only the last one is kept: the number of rows often changes
-            self._caches = {rows: self.target.new_cache(rows, self.target.max_prompt + self.size)}
-        self._caches[rows].length = 0
-        return self._caches[rows]
 
 
 @torch.inference_mode()

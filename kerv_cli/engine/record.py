@@ -17,7 +17,6 @@ PARALLEL = "parallel"  # mode of a round, and of its decode, in which a parallel
 
 # phases of a decode; their seconds add up to `DecodeRecord.seconds`; `vision` is the time of `Target.encode`
 PHASES = ("vision", "prefill", "propose", "verify", "accept", "rectify", "other")
-UNTIMED = dict.fromkeys(PHASES, math.nan)  # of episodes that were decoded together: a single decode has no time
 
 
 @dataclass(frozen=True)
@@ -207,7 +206,7 @@ class EpisodeRecord:
     frames: dict[int, np.ndarray] = field(default_factory=dict)  # control step -> (h, w, 3) uint8, if recorded
     closest_approach: float = math.nan  # least distance of fingertips to object, metres; NaN: unknown
     object_moved: float = math.nan  # largest motion of the object after the fingertips came near, metres; NaN: unknown
-    wall_seconds: float = 0.0  # whole episode, with simulation and rendering; in a batch, an equal share of its time
+    wall_seconds: float = 0.0  # whole episode, with simulation and rendering
     places: dict[str, np.ndarray] = field(default_factory=dict)  # object, goal, … -> (T + 1, 3) metres, if recorded
 
     @property

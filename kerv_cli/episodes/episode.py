@@ -6,13 +6,12 @@ import dataclasses
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from kerv_cli.base.errors import KervError, UsageError
-from kerv_cli.base.spaces import ActionSpace, Observation
+from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Follower
 from kerv_cli.engine.record import DecodeRecord, Delay, EpisodeRecord
 from kerv_cli.episodes.settings import CHUNK
@@ -143,39 +142,16 @@ def run_episode(
     Simulation and rendering do not count as inference time. `camera` is recorded in every control step, None records
     nothing. `clock` gives the latency of each decode if the world goes on during it (docs/methods.md §8).
     """
-    steps = episode(world, decoder, seed, camera, clock)
-    decode: Any = None
-    while True:
-        try:
-            observation = steps.send(decode)
-        except StopIteration as end:
-            record: EpisodeRecord = end.value
-            return record
-        decode = decoder.decode(observation)
-
-
-def episode(
-    world: World,
-    follower: Follower,
-    seed: int,
-    camera: CameraSettings | None = None,
-    clock: RealClock | None = None,
-) -> Generator[Observation, DecodeRecord, EpisodeRecord]:
-    """Run one episode like `run_episode`, but let the caller decode.
-
-    The generator yields observations. Send it the record of each observation's decode. At the end it returns the
-    episode's record. `follower` is the decoder, or what `BatchDecoder.new_episode` returned for this episode.
-    """
     began = time.perf_counter()
     world.reset(seed)
-    follower.reset(world.task, seed, world.end_effector)
-    execution = _Execution(world, follower, camera)
+    decoder.reset(world.task, seed, world.end_effector)
+    execution = _Execution(world, decoder, camera)
     decodes: list[DecodeRecord] = []
     decode_steps: list[int] = []
     if clock is not None:
         clock.expected = 0
     while not world.done:
-        decode = yield world.observe(follower.cameras)
+        decode = decoder.decode(world.observe(decoder.cameras))
         if clock is not None:
             delay = clock.delay(decode, len(execution.actions))
             decode = dataclasses.replace(decode, delay=execution.during(delay))
@@ -183,7 +159,7 @@ def episode(
         decode_steps.append(len(execution.actions))
         execution.chunk = deque(decode.actions[decode.delay.dropped if decode.delay else 0 :])
         execution.until(0 if clock is None else clock.expected)
-    follower.finish(world.succeeded)
+    decoder.finish(world.succeeded)
     return EpisodeRecord(
         environment=world.spec.name,
         space=world.spec.actions,

@@ -34,6 +34,7 @@ NOT_DETERMINING = frozenset(
     {"task", "episodes", "seed", "policy", "method", "results", "store", "record", "record_size"}
 )
 NOT_DETERMINING_RUNTIME = frozenset({"workers", "launch"})
+NO_LONGER = frozenset({"ar_ms", "batch"})  # settings `rollout.*` of earlier versions, which stored settings may hold
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +63,11 @@ class Setting:
         skip = self.settings["skip"]
         return bool(skip.get("up") or skip.get("down"))
 
-    @property
-    def batch(self) -> int:
-        return int(self.settings["rollout"]["batch"])
-
     def on(self, *tasks: str) -> RolloutSettings:
-        return read_settings(RolloutSettings, {**self.settings, "task": list(tasks)})
+        settings = {**self.settings, "task": list(tasks)}
+        if isinstance(rollout := settings.get("rollout"), Mapping):
+            settings["rollout"] = without(rollout, NO_LONGER)
+        return read_settings(RolloutSettings, settings)
 
 
 def differences(new: Setting, old: Setting | None) -> str:
@@ -105,7 +105,8 @@ def work_of(settings: Plain, identity: Identity) -> str:
 
 
 def determining(settings: Plain) -> dict[str, Any]:
-    return {**without(settings, NOT_DETERMINING), "runtime": without(settings["runtime"], NOT_DETERMINING_RUNTIME)}
+    runtime = without(settings["runtime"], NOT_DETERMINING_RUNTIME)
+    return {**without(settings, NOT_DETERMINING), "runtime": runtime}
 
 
 def stress_of(settings: Plain) -> dict[str, Any]:

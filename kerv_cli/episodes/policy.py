@@ -71,9 +71,7 @@ def check(settings: RolloutSettings, is_awaited: bool = False) -> dict[str, str]
     method = Method.of(settings)
     if settings.deviation_every > 0:
         target.check_autoregressive(f"deviation_every={settings.deviation_every}", "there is no AR to differ from")
-        if settings.rollout.batch > 1:
-            raise UsageError(f"deviation_every={settings.deviation_every}: not in batches. Leave out rollout.batch")
-    method.check(target, settings.rollout.batch)
+    method.check(target)
     clock_for(settings, spec)
     is_profiled = settings.rollout.clock == REAL and settings.rollout.latency == PROFILE
     profile = {"profile": sha256_of(_profile_path(settings))} if is_profiled else {}
@@ -102,8 +100,7 @@ def _check_remote(settings: RolloutSettings, spec: EnvironmentSpec, is_awaited: 
 
 def _check_undecoded(settings: RolloutSettings) -> None:
     plain, default = (
-        {"rollout.batch": each.rollout.batch, "deviation_every": each.deviation_every, "chunk": each.chunk}
-        | each.parts()
+        {"deviation_every": each.deviation_every, "chunk": each.chunk} | each.parts()
         for each in (settings, RolloutSettings())
     )
     for key, value in plain.items():

@@ -272,7 +272,7 @@ def idle_keys(settings: RolloutSettings) -> dict[str, str]:
         drawn = dict.fromkeys(("size", "supersample"), f"{settings.policy.interface} wants pictures of {pixels} pixels")
         unused = {f"world.camera.{name}": reason for name, reason in drawn.items() if pixels}
         return unused | ({"method": "the server decides it"} if settings.policy.kind == REMOTE else {})
-    method, timing, batch = Method.of(settings), settings.rollout, settings.rollout.batch
+    method, timing = Method.of(settings), settings.rollout
     draft, proposer, skip = (method.parts[kind] for kind in ("prefill_draft", "proposer", "skip"))
     needed = set(method.needs)
     acceptance = AcceptancePart.find(settings.acceptance.kind)
@@ -294,8 +294,6 @@ def idle_keys(settings: RolloutSettings) -> dict[str, str]:
         idle["rollout.latency_ms"] = f"rollout.latency={timing.latency}"
     if timing.clock == REAL and timing.latency != PROFILE:
         idle["rollout.profile"] = f"rollout.latency={timing.latency} reads no profile"
-    if batch > 1:
-        idle |= dict.fromkeys(("record", "record_size"), f"rollout.batch={batch}: episodes of a batch are not recorded")
     if not settings.record:
         idle["record_size"] = "record=0 saves no recording"
     return idle

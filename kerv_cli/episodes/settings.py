@@ -26,13 +26,8 @@ class TimingSettings:
     latency_ms: float = number(0.0, 0, 600_000, help="latency=constant: milliseconds per decode")
     profile: str = setting("", "latency=profile: result file of `kerv bench`: its path, or its name in <results>/bench")
     delay_compensation: str = choice("none", "none", CHUNK, help="chunk: drop actions that come too late")
-    batch: int = number(1, 1, 1024, help="episodes that are decoded together; above 1, no times are measured")
 
     def check_together(self, prefix: str) -> None:
-        if self.batch > 1 and self.clock == REAL:
-            raise UsageError(
-                f"{prefix}batch={self.batch} with {prefix}clock=real: decodes of a batch have no times, use only one"
-            )
         if self.clock == REAL and self.latency == PROFILE and not self.profile:
             raise UsageError(
                 f"{prefix}latency=profile: name a document of 'kerv bench', such as {prefix}profile=mt10-vision-float32"

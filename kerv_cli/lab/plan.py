@@ -21,8 +21,6 @@ from kerv_cli.episodes.identity import Setting, differences
 
 MOST_EPISODES = 1_000_000
 """Largest number of episodes in a study."""
-FULL_BATCHES = 16
-"""Largest number of batches in a block."""
 
 NEVER, ALL = "never", "all"
 """Values of `rerun=`, which says which existing episodes to run again."""
@@ -74,10 +72,7 @@ def all_episodes(settings: Sequence[Setting], tasks: Iterable[str], block: int =
 
 @dataclass(frozen=True)
 class Block:
-    """Episodes of one task, which one process runs. The settings take turns, seed by seed.
-
-    A block that runs as a batch (several episodes at once) has a single setting instead, and any tasks and seeds.
-    """
+    """Episodes of one task, which one process runs. The settings take turns, seed by seed."""
 
     episodes: tuple[Episode, ...]
 
@@ -94,31 +89,20 @@ class Block:
         return sorted(set(map(attrgetter("seed"), self.episodes)))
 
     @property
-    def batch(self) -> int:
-        return self.episodes[0].setting.batch
-
-    @property
     def name(self) -> str:
         return f"{self.task} {seeds_text(self.seeds)}"
 
     @property
     def title(self) -> str:
-        if self.batch == 1:
-            return f"{self.name}: {count(len(self.settings), 'setting')} in turn"
-        label = self.episodes[0].setting.label
-        return f"{label} from {self.name} on: {count(len(self.episodes), 'episode')}, {self.batch} at a time"
+        return f"{self.name}: {count(len(self.settings), 'setting')} in turn"
 
     def turns(self) -> Iterator[Episode]:
         """Yield the episodes in the order in which they run.
 
-        They run seed by seed. For each seed the settings' order is random but reproducible. In a block that runs as a
-        batch, the order is that of `episodes`.
+        They run seed by seed. For each seed the settings' order is random but reproducible.
         """
         import numpy as np
 
-        if self.episodes and self.batch > 1:
-            yield from self.episodes
-            return
         for seed, turn in sorted(grouped(self.episodes, attrgetter("seed")).items()):
             digest = hashlib.sha256(f"{self.task} {seed}".encode()).digest()
             for index in np.random.default_rng(list(digest)).permutation(len(turn)):
@@ -225,33 +209,25 @@ def _keep_whole_orders(usable: dict[Episode, list[Any]], block: int) -> None:
             usable[one] = [row] if row else []
 
 
-def blocks_of(episodes: Iterable[Episode], block: int, workers: int = 1) -> list[Block]:
+def blocks_of(episodes: Iterable[Episode], block: int) -> list[Block]:
     """Group episodes into blocks, each to be run by one process.
 
     The episodes of a block have the same task and the same number of threads. They have up to `block`
     successive seeds. All seeds of a block run the same settings: seeds for which other settings must run get a block of
     their own. But if a setting's results depend on the order of its seeds, its seeds are never split.
 
-    Episodes that run as a batch are grouped by setting instead, into blocks small enough that every worker gets one.
-
     Args:
         episodes: The episodes to run.
         block: Largest number of seeds in a block.
-        workers: Number of processes.
     """
-    by_way = grouped(episodes, lambda one: one.setting.batch > 1)
     groups: dict[tuple[object, ...], list[Episode]] = {}
-    for (task, seed), turn in grouped(by_way.get(False, ()), lambda one: (one.task, one.seed)).items():
+    for (task, seed), turn in grouped(episodes, lambda one: (one.task, one.seed)).items():
         for threads, part in grouped(turn, lambda one: one.setting.settings["runtime"]["threads"]).items():
             index = (seed - min(one.setting.settings["seed"] for one in part)) // block
             ordered = list(filter(attrgetter("setting.depends_on_order"), part))
             same = sorted(map(attrgetter("setting.work"), ordered or part))
             groups.setdefault((task, threads, index, *same), []).extend(part)
-    blocks = list(map(Block, map(tuple, groups.values())))
-    for group in grouped(by_way.get(True, ()), lambda one: one.setting.work).values():
-        size = min(FULL_BATCHES * group[0].setting.batch, -(-len(group) // workers))
-        blocks += [Block(tuple(group[first : first + size])) for first in range(0, len(group), size)]
-    return blocks
+    return list(map(Block, map(tuple, groups.values())))
 
 
 def seeds_text(seeds: Iterable[int]) -> str:

@@ -56,7 +56,7 @@ class Plan:
     @functools.cached_property
     def blocks(self) -> list[Block]:
         """The episodes to run, grouped into blocks. One process runs a block. Blocks are ordered by first episode."""
-        return blocks_of(self.to_run, self.study.block, self.runtime.workers or 1)
+        return blocks_of(self.to_run, self.study.block)
 
     @property
     def is_elsewhere(self) -> bool:
@@ -215,7 +215,7 @@ def save(plan: Plan, run: str = "") -> None:
         if is_shared:
             _check_orders(study, to_run)
         last = connection.scalar(sa.select(sa.func.max(WANTED.c.block)).where(WANTED.c.study_id == number)) or 0
-        blocks = blocks_of({one.key: one for one in to_run}.values(), study.block, plan.runtime.workers or 1)
+        blocks = blocks_of({one.key: one for one in to_run}.values(), study.block)
         block_of = {one.key: index for index, block in enumerate(blocks, last + 1) for one in block.episodes}
         for one, row in to_run.items():
             row["block"] = block_of[one.key]

@@ -11,9 +11,9 @@ import os
 import secrets
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,7 +24,7 @@ from kerv_cli.engine.record import EpisodeRecord
 from kerv_cli.episodes.identity import ENGINE, OBSERVATION, Setting
 from kerv_cli.episodes.policy import artifacts_of, check
 from kerv_cli.episodes.rows import decodes_table, episode_row, seconds_blob, table_blob
-from kerv_cli.episodes.runner import Request, Runner, close_worlds, run_batch
+from kerv_cli.episodes.runner import Runner, close_worlds
 from kerv_cli.lab.database import now
 from kerv_cli.lab.plan import Block, Episode, seeds_text
 from kerv_cli.lab.queue import MOST_DEATHS, Claim, ClaimLost, Queue, patiently
@@ -46,7 +46,7 @@ RunEpisode = Callable[[int], EpisodeRecord]
 """Function that runs the episode with a given seed."""
 
 Prepare = Callable[[Setting, str], RunEpisode]
-"""Object that, when called, builds and warms up a setting's decoder for a task. Its method `together` runs batches."""
+"""Object that, when called, builds and warms up a setting's decoder for a task."""
 
 Save = Callable[[EpisodeRecord, Path, str], object]
 """Function that writes an episode to a .rrd file. The last argument is the setting's label."""
@@ -306,7 +306,7 @@ class _Attempt:
                 self._fail(self.claim.deadly, SettingFailed(f"{MOST_DEATHS} workers died in this episode"))
             if self.left:
                 self.on_event(BlockStarted(block))
-                for one, result, started in self._together() if block.batch > 1 else self._in_turn():
+                for one, result, started in self._in_turn():
                     if isinstance(result, Exception):
                         self._fail(one, failure_of(result))
                     elif one in self.left:
@@ -341,16 +341,6 @@ class _Attempt:
                 except Exception as error:  # noqa: BLE001 - the other settings go on
                     result = error
                 yield one, result, started
-
-    def _together(self) -> Iterator[tuple[Episode, EpisodeRecord | Exception, datetime]]:
-        self._begin(self.left[0])
-        try:
-            for one, result in self.prepare.together(list(self.left)):  # type: ignore[attr-defined]
-                seconds = 0.0 if isinstance(result, Exception) else result.wall_seconds
-                yield one, result, datetime.now(UTC) - timedelta(seconds=seconds)
-        except Exception as error:  # noqa: BLE001 - the other blocks go on
-            for one in list(self.left):
-                yield one, error, datetime.now(UTC)
 
     def _end(self, one: Episode, record: EpisodeRecord, started: datetime) -> None:
         row = episode_row(record) | {
@@ -416,25 +406,8 @@ class EpisodeRunner:
         def save(record: EpisodeRecord) -> None:
             self.save(record, self.rollouts / Episode(setting, record.task, record.seed).recording, setting.label)
 
-        return _loaded(setting, [task], lambda: Runner(setting.on(task), task, save)).episode
-
-    def together(self, episodes: Sequence[Episode]) -> Iterator[tuple[Episode, EpisodeRecord | Exception]]:
-        """Run episodes of one setting, `rollout.batch` at a time.
-
-        Yield each episode with its record, or with the error that its world raised.
-        """
-        setting = episodes[0].setting
-        settings = setting.on(episodes[0].task)
-        requests = [Request(one, one.task, one.seed) for one in episodes]
-        tasks = list(dict.fromkeys(one.task for one in episodes))
-        for request, result in _loaded(setting, tasks, lambda: run_batch(settings, requests)):
-            yield request.key, result
-
-
-def _loaded(setting: Setting, tasks: list[str], load: Callable[[], T]) -> T:
-    """Call `load`. Refuse weights on the disk that differ from the plan's, before or after the call."""
-    results = str(setting.settings["results"])
-    checked(setting, tasks, results, is_awaited=True)
-    loaded = load()
-    checked(setting, tasks, results, is_awaited=True)
-    return loaded
+        results = str(setting.settings["results"])
+        checked(setting, [task], results, is_awaited=True)
+        runner = Runner(setting.on(task), task, save)
+        checked(setting, [task], results, is_awaited=True)  # nobody has replaced the weights while they were read
+        return runner.episode

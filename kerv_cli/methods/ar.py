@@ -7,4 +7,4 @@ from kerv_cli.base.registry import PREFILL, BoundaryPart, ProposerPart, Rectifie
 ProposerPart("none", colour=0x6E7B8B, when=PREFILL).add()
 RectifierPart("reinfer").add()  # the target decodes on
 BoundaryPart("always").add()  # the method has one proposer
-SkipPart("none", batchable=True).add()
+SkipPart("none").add()

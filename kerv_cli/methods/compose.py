@@ -48,7 +48,7 @@ class Method:
             kinds += part.needed(self.settings[kind])
         return tuple(dict.fromkeys(kinds))
 
-    def check(self, target: Target | TargetDescription, batch: int = 1) -> None:
+    def check(self, target: Target | TargetDescription) -> None:
         """Refuse parts that do not work together or with the target, and numbers out of range. Loads no weights."""
         from kerv_cli.engine.chunk import chunk_steps  # imports numpy, which a mistyped key must not wait for
 
@@ -90,18 +90,6 @@ class Method:
             raise UsageError(
                 f"skip={skip.name} with prefill_draft={draft.name}: it executes a draft from before the prefill"
             )
-        if batch > 1:
-            self._check_batch(batch)
-
-    def _check_batch(self, batch: int) -> None:
-        draft, skip, threshold = (self.parts[kind] for kind in ("prefill_draft", "skip", "threshold"))
-        is_used = draft.absent or skip.takes_draft
-        if not (self.parts["proposer"].absent and self.parts["boundary"].absent and skip.batchable and is_used):
-            raise UsageError(
-                f"rollout.batch={batch}: method={self.name} decodes one episode at a time. Leave rollout.batch out"
-            )
-        if not draft.absent and not threshold.batchable:
-            raise UsageError(f"rollout.batch={batch}: threshold={threshold.name} follows one episode. Use another")
 
     def decoder(self, target: Target, artifact: Callable[[str], Any], task: str = "") -> Decoder:
         """Build the decoder. `artifact` loads the artifact of a kind, and is called only for the kinds in `needs`."""

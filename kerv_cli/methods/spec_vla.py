@@ -51,4 +51,4 @@ class FixedThresholdSettings:
     r: int = number(9, 0, MOST_BINS)  # largest accepted distance to the target's token, bins
 
 
-ThresholdPart("fixed", FixedThresholdSettings, radius="r", batchable=True, any_code=True)(Fixed)
+ThresholdPart("fixed", FixedThresholdSettings, radius="r", any_code=True)(Fixed)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 TRUSTED, STREAK = "trusted", "streak"
 
 
-@SkipPart("parallel", colour=0x17BECF, verifies=False, batchable=True)
+@SkipPart("parallel", colour=0x17BECF, verifies=False)
 class ParallelPass(Skip):
     """Decodes all tokens of a chunk in one bidirectional forward of a parallel target. No token is verified."""
 
@@ -111,7 +111,7 @@ class StreakSkip(Skip):
         self.allowed = self.left = min(self.settings.most, 2 * self.allowed or 1) if agrees else 0
 
 
-@SkipPart("always", takes_draft=True, verifies=False, batchable=True, any_code=True)
+@SkipPart("always", takes_draft=True, verifies=False, any_code=True)
 class AlwaysSkip(Skip):
     """Executes every draft without verification. If there is no draft of a whole chunk, the target decodes."""
 

@@ -69,7 +69,7 @@ def repriced(data: StudyData, profiles: Sequence[NamedProfile], lenient: bool = 
     here = data.episodes[data.episodes["server_decodes"].fillna(0) == 0]  # a server's phases are unknown
     decoded, works = here.groupby("label")[["forwards", "skipped_decodes"]].sum().any(axis=1), {}
     for label in data.labels:
-        if decoded.get(label) and not (lenient and data.settings[label].batch > 1):
+        if decoded.get(label):
             works[label] = _work_of_label(data, label)
     rows = []
     for named in profiles if works else ():
@@ -129,10 +129,6 @@ class _LabelWork(NamedTuple):
 
 
 def _work_of_label(data: StudyData, label: str) -> _LabelWork:
-    if (batch := data.settings[label].batch) > 1:
-        raise UsageError(
-            f"setting '{label}' ran {batch} episodes at a time, without times: run it with rollout.batch=1"
-        )
     episodes = data.episodes.loc[data.episodes["label"] == label, "episode"]
     table = decodes_of(data.study, episodes.tolist(), READ).combine_chunks()
     rounds = table["rounds"].combine_chunks()

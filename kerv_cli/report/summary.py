@@ -247,8 +247,6 @@ def setting_tables(data: StudyData) -> Iterator[tuple[Any, Any, str]]:
     observation = setting.identity.get("observation", "")
     title = f"{setting.label}, observation {observation}{stress_text(setting.settings)}, {seeds}"
     timed = episodes["seconds"].notna().all()
-    if not timed:
-        title += f"; not timed: {setting.batch} episodes at a time"
     yield _TASK_COLUMNS, rows, title
     if timed:
         decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()
