@@ -64,6 +64,7 @@ pip() {
 }
 # By itself and without what it needs, so that the second index serves nothing else. All else must have a known hash.
 if [ "$build" = cpu ]; then
+    echo "PyTorch ..."
     torch=$(grep '^torch==' requirements/cpu.txt)
     if ! "$venv/bin/python" -m pip freeze --disable-pip-version-check 2>/dev/null | grep -qxF "$torch" &&
         ! pip --no-deps --retries 1 --extra-index-url "$cpu_index" "$torch" 2>/dev/null; then
@@ -73,6 +74,9 @@ if [ "$build" = cpu ]; then
 fi
 files=(--requirement requirements/common.txt)
 [ "$build" = cpu ] || files+=(--requirement requirements/cuda.txt)
+if [ "$build" = cpu ]; then echo "The other packages, about a minute ..."; else echo "PyTorch and the other packages ..."; fi
 pip --no-deps --require-hashes "${files[@]}"
+echo "kerv itself ..."
 pip --no-deps --no-build-isolation --editable '.[dev]'
 touch "$stamp"
+echo "kerv is installed. $venv/bin/kerv doctor checks this machine, make demo shows what kerv does"

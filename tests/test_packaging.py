@@ -205,7 +205,9 @@ def setup_lines(result: subprocess.CompletedProcess[str]) -> list[str]:
 
 
 def test_setup_installs_once(checkout):
-    assert checkout.setup().returncode == 0
+    first = checkout.setup()
+    assert first.returncode == 0
+    assert ".venv/bin/kerv doctor" in first.stdout.splitlines()[-1]
     pip = "pip install --quiet --disable-pip-version-check"
     index = "https://download.pytorch.org/whl/cpu"
     assert checkout.log == [
