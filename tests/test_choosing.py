@@ -112,6 +112,8 @@ def test_what_is_not_shown_yet_says_how_many_pairs_more_would_do(rows):
     assert said.endswith("more pairs would show it for r=9")
     assert verdict_of(rows, 2.0).episodes == math.ceil(found.candidate_pairs)
     assert verdict_of(rows, 4.0).episodes == 0, "a setting is named already"
+    assert choose(rows, 0.5).candidate_pairs > 10 * 200
+    assert verdict_of(rows, 0.5).episodes == 0, "more than ten times what ran is no advice"
     slower = choose(only(rows, "ar", "slow"), 2.0)
     assert sentence(slower, 2.0, "ar") == "no setting is shown to be faster per episode than ar (200 pairs)"
     far = replace(found, candidate_pairs=110_128.0)

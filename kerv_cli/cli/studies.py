@@ -212,8 +212,9 @@ def print_verdict(report: Report) -> None:
     if note := caution(data.results):
         typer.echo(f"note: {note}")
     typer.echo(f"verdict: {report.verdict.sentence}")
-    if command := report.command_to_settle:
-        typer.echo(f"settle it: {command}")
+    command, time = report.to_settle
+    if command:
+        typer.echo(f"settle it, in about {time}: {command}")
     typer.echo(f"table: {report.files[0]}")
     typer.echo(f"page: {report.files[-1]}")
     typer.echo(f"browse: kerv board{results_word(study.database.words)}")

@@ -18,7 +18,7 @@ from urllib.parse import quote
 import altair as alt
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from kerv_cli.base.durations import count
+from kerv_cli.base.durations import count, duration
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import write_json, write_text
 from kerv_cli.episodes.identity import NOT_DETERMINING, without
@@ -82,10 +82,16 @@ class Report:
         return verdict_of(self.data.results, self.loss)
 
     @property
-    def command_to_settle(self) -> str:
-        """The command that runs enough episodes for the verdict to name a setting. Empty if `Verdict.episodes` is 0."""
-        study, episodes = self.data.study, self.verdict.episodes
-        return sweep_command(study, f"episodes={episodes}") if study.kind == SWEEP and episodes else ""
+    def to_settle(self) -> tuple[str, str]:
+        """The command that runs enough episodes for the verdict to name a setting, and how long it takes.
+
+        Both are empty if `Verdict.episodes` is 0.
+        """
+        data, study, episodes = self.data, self.data.study, self.verdict.episodes
+        if study.kind != SWEEP or not episodes:
+            return "", ""
+        more = episodes * len(study.tasks) * len(study.settings) - len(data.episodes)
+        return sweep_command(study, f"episodes={episodes}"), duration(data.episodes["wall_seconds"].mean() * more)
 
     @functools.cached_property
     def figures(self) -> dict[str, alt.ConcatChart]:
@@ -219,7 +225,7 @@ def study_parts(report: Report) -> dict[str, Any]:
         "verdict": report.verdict,
         "answer": answer,
         "order": order_of(data.by_speed),
-        "settles": report.command_to_settle,
+        "settles": report.to_settle,
         "caution": caution(rows),
         "missing": len(data.absent),
         "absent": list(dict.fromkeys(f"{one.setting.label} on {one.task}" for one in data.absent)),

@@ -100,7 +100,7 @@ class Verdict(NamedTuple):
     sentence: str
     is_shown: bool = False  # whether a setting is shown both to be faster and to lose less success than is accepted
     # about how many episodes per task would let the sentence name a setting. 0 if it names one already, if more would
-    # not help, or if more than 10,000 pairs would be needed.
+    # not help, or if more than ten times as many pairs as there are would be needed
     episodes: int = 0
 
 
@@ -114,7 +114,7 @@ def verdict_of(results: Sequence[Result], loss: float) -> Verdict:
     if len(baselines) > 1:
         return Verdict(f"{under_conditions(rows)}.")
     found = choose(rows, loss)
-    episodes = math.ceil(found.candidate_pairs / rows[0].tasks) if found.candidate_pairs <= stats.MOST_PAIRS else 0
+    episodes = math.ceil(found.candidate_pairs / rows[0].tasks) if found.candidate_pairs <= 10 * found.pairs else 0
     return Verdict(f"{sentence(found, loss, rows[0].baseline)}.", found.is_shown, episodes)
 
 
