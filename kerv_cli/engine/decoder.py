@@ -23,7 +23,7 @@ from kerv_cli.engine.decisions import Judged, TokenTree
 from kerv_cli.engine.draft import EMPTY, Draft, read, upload
 from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold
 from kerv_cli.engine.proposer import Proposer
-from kerv_cli.engine.protocol import Cache, ContinuesGreedily, PredictsTokens, Target
+from kerv_cli.engine.protocol import ContinuesGreedily, PredictsTokens, Target
 from kerv_cli.engine.record import MEAN, PHASES, DecodeRecord, Round, variability
 
 
@@ -345,20 +345,19 @@ class Decoder(Follower):
 
 
 @torch.inference_mode()
-def greedy(target: Target, prompt: Tensor, cache: Cache | None = None, size: int = 0) -> tuple[Tensor, Tensor]:
+def greedy(target: Target, prompt: Tensor) -> tuple[Tensor, Tensor]:
     """Decode a batch of prompts autoregressively.
 
     Args:
         prompt: The prompts' embeddings (B, P, E).
-        cache: An empty cache with room for P + N tokens. If None, a new cache is made.
-        size: N, number of tokens to decode. If 0, the largest number that a chunk of the target can have.
 
     Returns:
-        The decoded tokens (B, N): after an end token, all are end tokens. The hidden states (B, P + N − 1, E) of the
-        prompt and of all decoded tokens but the last.
+        The decoded tokens (B, N), where N is the largest number that a chunk of the target can have: after an end
+        token, all are end tokens. The hidden states (B, P + N − 1, E) of the prompt and of all decoded tokens but the
+        last.
     """
-    length, size = prompt.shape[1], size or target.actions.longest(target.chunk)
-    cache = cache or target.new_cache(len(prompt), length + size)
+    length, size = prompt.shape[1], target.actions.longest(target.chunk)
+    cache = target.new_cache(len(prompt), length + size)
     positions = torch.arange(length + size - 1, device=prompt.device)
     hidden = [target.forward(prompt, positions[:length], cache)]
     tokens = [target.head(hidden[0][:, -1]).argmax(-1)]
