@@ -28,7 +28,7 @@ _is_interrupted = False
 def _interrupt(number: int, frame: FrameType | None) -> None:
     """Raise KeyboardInterrupt. On a second interrupt, end at once: the database rolls back, and locks are free.
 
-    Also end at once while a module is loading: if C++ code runs Python, an exception there aborts the process.
+    Also end at once while a module is loading: C++ code may be running it, and an exception would abort the process.
     """
     global _is_interrupted
     while frame is not None and not _is_interrupted:

@@ -15,11 +15,11 @@ MOST_DECODES = 1_000_000  # limit of settings that count decodes of an episode
 
 
 def setting(default: Any, help: str = "", **metadata: Any) -> Any:
-    """Return a field of a settings dataclass.
+    """Make a field of a settings dataclass.
 
     `default` is the value, or a function (such as a dataclass) that makes it. `help` is one line for `--help` and
-    `--cfg`. `metadata` can have `limits` (from the function `limits`), `names` (the allowed values) and `group`: for a
-    field named like a folder of conf/, the choice in this folder that is the default.
+    `--cfg`. `metadata` can have `limits` (from the function `limits`), `names` (the allowed values) and `group` (the
+    default file in the folder of conf/ that has the field's name).
     """
     metadata |= {"help": help} if help else {}
     if callable(default):

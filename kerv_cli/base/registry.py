@@ -179,8 +179,8 @@ class ProposerPart(Part):
         merged: Whether it merges chains of several proposers.
         has_boundary: Whether a boundary chooses between retrieval and a drafter.
         looks_up: Whether it searches a datastore.
-        cost: Kind of cost under which a latency profile gives the seconds of a draft. Empty if it has no cost.
-        measured_by: Name of the method that `kerv bench` runs to measure this cost. Empty if it measures none.
+        cost: Key of a draft's seconds in a latency profile. Empty if a draft costs nothing.
+        measured_by: Name of the method that `kerv bench` runs to measure this cost. Empty if the cost is not measured.
     """
 
     kind = "proposer"

@@ -232,7 +232,7 @@ class ActionSpace:
     def check_same(self, other: ActionSpace, here: str, there: str, statistics: bool = False) -> None:
         """Refuse an action space that differs in names, groups, strict DoFs, bins or control rate.
 
-        With `statistics`, also refuse another `low`, `high`, `end_token` or `code`, with which a token means another
+        With `statistics`, `low`, `high`, `end_token` and `code` must be equal, too, or a token would mean another
         action. `here` and `there` say in the error message what the two spaces belong to.
         """
         normalisation = ("low", "high", "end_token", "code") if statistics else ()

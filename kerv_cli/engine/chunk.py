@@ -247,7 +247,7 @@ class Chunk:
         self.tokens += self.space.bins_of(values).flatten()[start:].tolist()
 
     def history(self) -> np.ndarray:
-        """Return `Follower.history` as if this chunk's complete control steps were executed. FAST tokens: none is."""
+        """Return `Follower.history` as if this chunk's complete control steps were executed (FAST tokens have none)."""
         whole = 0 if self.space.code else len(self.tokens) // self.dofs
         decided = self.space.values_of(np.array(self.tokens[: whole * self.dofs], dtype=np.int64))
         return self.episode.history(decided.reshape(whole, self.dofs))

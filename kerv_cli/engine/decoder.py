@@ -285,8 +285,8 @@ class Decoder(Follower):
     def commit(self, chunk: Chunk, verified: Verified, accepted: Accepted, proposer: Proposer | None) -> Tensor:
         """Commit the accepted path and, if the chunk has room, the bonus: the target's next token.
 
-        Returns the hidden states (1, b + a, E) of the b tokens before the draft in this forward, and of the a accepted
-        draft tokens.
+        Returns the hidden states (1, b + a, E): of the b tokens before the draft in the verified forward, and of the
+        a accepted draft tokens.
         """
         tree, target_tokens, (path, rejected) = verified.tree, verified.target_tokens, accepted
         if proposer is None or not len(tree):

@@ -70,7 +70,7 @@ class Profile:
     def times(self, kind: str, rows: np.ndarray) -> np.ndarray:
         """Return the seconds (n,) of n forwards or drafts of a kind, over `rows` (n,) tokens each.
 
-        Seconds are linear between the measured numbers of tokens, and beyond the largest one.
+        Seconds are linear between the measured numbers of tokens and beyond the largest; below the smallest, constant.
         """
         measured, times = self.phases[kind]
         seconds: np.ndarray = np.interp(rows, measured, times)

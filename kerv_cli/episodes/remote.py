@@ -99,7 +99,7 @@ class Server:
             raise KervError(f"{self.url} serves another policy now: its metadata has changed")
 
     def reached(self, since: float, patience: float) -> Message:
-        """Connect and return the metadata. Try until `patience` s after `since`; only once after an earlier failure."""
+        """Connect and return the metadata. Retry until `patience` s after `since`; if an earlier call failed, never."""
         patience = 0.0 if self._given_up else patience
         is_said = False
         while True:

@@ -112,7 +112,7 @@ class Artifact(Generic[T]):
         """Refuse a use for which the artifact lacks something. This base class allows every use."""
 
     def is_complete(self, description: T, kinds: Collection[str]) -> bool:
-        """Return whether the artifact holds all that a policy needs of it, if the policy has artifacts of `kinds`."""
+        """Return whether the artifact holds all that a policy needs of it. `kinds`: those that the policy has."""
         return True
 
     def digest(self, path: Path, description: T) -> str:

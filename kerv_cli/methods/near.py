@@ -113,10 +113,10 @@ def probabilities(guesses: np.ndarray, scales: np.ndarray, vocabulary: int) -> n
 
 
 def likely_tree(table: np.ndarray, weights: np.ndarray, nodes: int) -> tuple[list[int], list[int]]:
-    """Return the tokens and the parents (−1 for the root) of the draft tree's `nodes` most probable nodes.
+    """Return the tokens and the parents (−1: the root) of the draft tree's `nodes` most probable nodes.
 
     Args:
-        table: Probability of each token under each guess, (2, places, V).
+        table: Probability of each token at each place of the draft, under each of two guesses, (2, places, V).
         weights: Trust in each guess, (2,). Along a path, trust shifts to the guess that made its tokens more probable.
     """
     import numpy as np

@@ -82,7 +82,7 @@ class Interface:
         return numbers[:few], np.concatenate([numbers, np.zeros(many - len(numbers))])
 
     def converted(self, actions: np.ndarray) -> np.ndarray:
-        """Return actions (H, D) float64 in environment units, but the gripper in the client's convention."""
+        """Return the policy's actions (H, D) as float64, environment units, the gripper in the client's convention."""
         values, strict = actions.astype(np.float64), self.actions.is_strict
         if self.gripper in OPEN:
             values[:, strict] = np.where(values[:, strict] > 0.5, OPEN[self.gripper], -OPEN[self.gripper])

@@ -235,7 +235,7 @@ def fit_boundary(paths: list[np.ndarray], windows: Sequence[int], progress: OnPr
 def episode_windows(episode: DemoEpisode, actions: ActionSpace, window: int, horizon: int) -> np.ndarray:
     """Cut out the expert's actions around each moment (control step) that has `window` control steps before it.
 
-    At the end of an episode, actions come from the recording, which goes on after the last control step.
+    The recording has actions beyond the episode's last control step; the last windows end in them.
 
     Returns:
         (n, window + horizon, D) float32: the expert's normalised actions around each of the n moments, oldest first.

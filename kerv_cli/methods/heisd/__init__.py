@@ -242,7 +242,7 @@ class FusedBoundarySettings:
     idle=lambda settings: {} if settings.f_star is None else {"quantile": "boundary.f_star names the limit"},
 )
 class Fused(Boundary):
-    """Chooses retrieval if F ≥ F* (see the settings), else, or with fewer than three positions, the drafter."""
+    """Chooses retrieval if F ≥ F* (see the settings), else the drafter. Before three hand positions: the drafter."""
 
     def __init__(self, settings: FusedBoundarySettings, context: Context) -> None:
         super().__init__(settings)

@@ -445,7 +445,8 @@ def run(
 ):
     """Execute a table of operations on all frames, `end` − `begin` times.
 
-    After each execution the rotary positions grow by 1, and the number of cached tokens grows by T.
+    After each execution the rotary positions grow by 1, and the number of cached tokens grows by T. In the shapes,
+    `times` is the number of executions of all calls together.
 
     Args:
         ops: (operations, columns) int64, see `recording.COLUMNS`.
@@ -460,8 +461,8 @@ def run(
         keys: (layers, B · A, panels, C, PANEL) copy of the keys, see `attention`.
         values: (layers, B · A, panels, slots, PANEL) copy of the values.
         mask: (T, start + T · times), 0 for slots that a row sees. Shape (0, 1) means that attention is causal.
-        results: (times, 1, B · T), filled with the result of ARGMAX in each execution. For programs that draft a tree
-            (times, 4, k²), filled by `branch`.
+        results: (times, 1, B · T), row i filled with the result of ARGMAX in execution i. For programs that draft a
+            tree (times, 4, k²), filled by `branch`.
         stop: Stop after the execution whose result for the first row equals `stop`. If negative, execute until `end`.
     """
     rows, size = frames.shape

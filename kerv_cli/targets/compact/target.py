@@ -139,7 +139,7 @@ class CompactTarget(Compilable):
         return self.vision, *self.further_views
 
     def pooled(self, prompt: Tensor) -> Tensor:
-        """Return (B, F): scene tokens, proprioception token, mean of the word tokens, and of the vision tokens."""
+        """Return (B, F): scene tokens, proprioception token, mean word token and mean vision token, concatenated."""
         parts = self.segments
         pooled = [prompt[:, parts["scene"]].flatten(1), prompt[:, parts["proprioception"]].flatten(1)]
         pooled += [prompt[:, parts[name]].mean(1) for name in ("instruction", "vision") if name in parts]
