@@ -217,3 +217,60 @@ def test_the_first_page_and_the_results_stay_short():
         assert len(shown) <= tables, page
         assert max(len(rows) - 2 for rows in shown) <= 8, page
         assert max(rows[0].count("|") - 1 for rows in shown) <= columns, page
+
+
+SPEED, LOSS = "episode_speedup", "difference"
+# A page, a part of one of its bold sentences, and what must hold: table (@*: its prices on two machines), settings,
+# measure, and the limits between which the intervals lie, or "holds 1": neither faster nor slower is shown.
+CLAIMS = [
+    ("README.md", "Spec-VLA and KERV decode 1.6 to 1.8 times", "papers@*", "spec_vla kerv", SPEED, (1.55, 1.85)),
+    ("README.md", "HeiSD 2.3 to 2.8 times", "papers@*", "heisd", SPEED, (2.1, 3.1)),
+    ("README.md", "KERV is not shown to be faster", "papers_against_spec_vla", "kerv", SPEED, "holds 1"),
+    ("README.md", "drafts of fifty tokens are not shown to gain anything", "papers", "spec_vla", SPEED, "holds 1"),
+    ("README.md", "drafts of five do", "papers", "spec_vla_chain", SPEED, (1, 9)),
+    (
+        "results/README.md",
+        "yes: Spec-VLA and KERV",
+        "papers@*",
+        "spec_vla spec_vla_few kerv kerv_few",
+        SPEED,
+        (1, 1.85),
+    ),
+    ("results/README.md", "HeiSD 2.3 to 3.9", "papers@*", "heisd heisd_code", SPEED, (2.1, 4.3)),
+    ("results/README.md", "its tree and KERV's are not shown to be", "papers", "spec_vla kerv", SPEED, "holds 1"),
+    ("results/README.md", "HeiSD is", "papers", "heisd heisd_code", SPEED, (1, 9)),
+    ("results/README.md", "HeiSD lose less than 3 points", "papers_small", "spec_vla kerv heisd", LOSS, (-0.03, 1)),
+    (
+        "results/README.md",
+        "HeiSD lose less than 3 points",
+        "papers_libero_small",
+        "spec_vla kerv heisd",
+        LOSS,
+        (-0.03, 1),
+    ),
+    ("results/README.md", "loses over 50 points", "papers_libero_small", "kerv_without_rest", LOSS, (-1, -0.5)),
+    ("results/README.md", "never saw the task", "coverage_unseen", "early_unverified", LOSS, (-1, 0)),
+    ("results/README.md", "only unverified drafts are shown", "mt50_methods", "early_unverified", SPEED, (1, 9)),
+    ("results/README.md", "only unverified drafts are shown", "mt50_methods", "one_pass_streak", SPEED, "holds 1"),
+    ("results/README.md", "gain more than Meta-World's", "papers_libero_trees", "spec_vla_chain", SPEED, (1.6, 9)),
+    ("results/README.md", "gain more than Meta-World's", "papers", "spec_vla_chain", SPEED, (1, 1.6)),
+    ("results/README.md", "are slower than AR", "main", "spec_vla kerv heisd one_pass", SPEED, (0, 1)),
+]
+
+
+@pytest.mark.parametrize(("page", "said", "table", "settings", "measure", "limits"), CLAIMS)
+def test_a_bold_sentence_lies_within_its_intervals(page, said, table, settings, measure, limits):
+    bold = " ".join(re.findall(r"\*\*(.*?)\*\*", (ROOT / page).read_text(encoding="utf-8"), re.DOTALL))
+    assert said in " ".join(bold.split())
+    name, machine, _ = table.partition("@")
+    wanted = settings.split()
+    rows = module_of(ROOT / "scripts/figures.py").table_of(f"{name}_on" if machine else name)
+    found = [row for row in rows if row["label"].replace(" ", "_") in wanted]
+    found = [row for row in found if row.get("on") in (None, "h100-openvla-7b", "a100-openvla-7b-eager")]
+    assert len(found) == len(wanted) * (2 if machine else 1)
+    for row in found:
+        low, high = (float(row[f"{measure}_{end}"]) for end in ("low", "high"))
+        if limits == "holds 1":
+            assert low <= 1 <= high
+        else:
+            assert limits[0] <= low <= high <= limits[1]
