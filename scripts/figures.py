@@ -53,10 +53,17 @@ def _further(study: str) -> dict[str, dict[str, str]]:
     """label -> the measures that are in `<study>.json` instead of a column; none of an older table."""
     path = TABLES / f"{study}.json"
     labels = json.loads(path.read_text(encoding="utf-8"))["labels"] if path.is_file() else {}
-    return {
-        label: {name: "" if value is None else str(value) for name, value in about["measures"][_POOLED].items()}
-        for label, about in labels.items()
-    }
+    found = {}
+    for label, about in labels.items():
+        measures = about["measures"][_POOLED] | {"bias": _largest(about.get("acceptance") or {})}
+        found[label] = {name: "" if value is None else str(value) for name, value in measures.items()}
+    return found
+
+
+def _largest(acceptance: Mapping[str, list[float | None]]) -> float | None:
+    """Of the DoFs' mean differences between accepted drafts and the target's tokens, the one furthest from 0."""
+    known = [one for one in acceptance.get("mean_accepted_difference_per_dof", ()) if one is not None]
+    return max(known, key=abs, default=None)
 
 
 def publish(studies: list[str]) -> None:
@@ -141,6 +148,7 @@ COLUMNS: dict[str, tuple[str, Callable[[Row], str]]] = {
     "felt": ("a decode takes, ms", lambda row: _number(row, "felt_latency_ms", ".0f")),
     "held": ("steps on a held action", lambda row: _number(row, "held_share", ".0f", 100, " %")),
     "again": ("again", _again),
+    "bias": ("mean difference of accepted drafts, bins", _own(lambda row: _number(row, "bias", "+.1f"))),
 }
 
 
