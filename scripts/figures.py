@@ -148,7 +148,7 @@ COLUMNS: dict[str, tuple[str, Callable[[Row], str]]] = {
     "felt": ("a decode takes, ms", lambda row: _number(row, "felt_latency_ms", ".0f")),
     "held": ("steps on a held action", lambda row: _number(row, "held_share", ".0f", 100, " %")),
     "again": ("again", _again),
-    "bias": ("mean difference of accepted drafts, bins", _own(lambda row: _number(row, "bias", "+.1f"))),
+    "bias": ("mean difference of accepted drafts, bins", _own(lambda row: _number(row, "bias", "+.2f"))),
 }
 
 
