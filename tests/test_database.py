@@ -7,6 +7,7 @@ import os
 import resource
 import signal
 import sqlite3
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +141,18 @@ def test_first_commands_at_once_create_one_set_of_tables(database, tmp_path):
         process.join(60)
         assert process.exitcode == 0
     assert count(database, STUDIES) == 40
+
+
+def test_a_file_that_another_process_changes_is_waited_for(tmp_path):
+    """SQLite refuses the first PRAGMA at once then, whatever the timeout."""
+    other = sqlite3.connect(tmp_path / "kerv.db", isolation_level=None, check_same_thread=False)
+    other.execute("CREATE TABLE own (x)")
+    other.execute("BEGIN IMMEDIATE")
+    threading.Timer(0.3, other.execute, ["COMMIT"]).start()
+    database = Database(tmp_path)
+    begun(database, "a")
+    assert count(database, STUDIES) == 1
+    other.close()
 
 
 KILLED = """
