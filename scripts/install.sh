@@ -73,8 +73,12 @@ if [ "$build" = cpu ]; then
     fi
 fi
 files=(--requirement requirements/common.txt)
-[ "$build" = cpu ] || files+=(--requirement requirements/cuda.txt)
-if [ "$build" = cpu ]; then echo "The other packages, about a minute ..."; else echo "PyTorch and the other packages ..."; fi
+if [ "$build" = cpu ]; then
+    echo "The other packages, about a minute ..."
+else
+    files+=(--requirement requirements/cuda.txt)
+    echo "PyTorch and the other packages ..."
+fi
 pip --no-deps --require-hashes "${files[@]}"
 echo "kerv itself ..."
 pip --no-deps --no-build-isolation --editable '.[dev]'

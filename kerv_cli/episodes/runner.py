@@ -7,6 +7,7 @@ that no setting becomes faster through the caches of another.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 
@@ -81,11 +82,9 @@ def is_recorded(settings: RolloutSettings, seed: int) -> bool:
 
 def success_of(target: Target, tasks: Iterable[str], seeds: Sequence[int], settings: WorldSettings) -> float:
     """Run one episode per task and seed, and return the share of successes. The target decodes as it was trained to."""
-    decoder, outcomes = native_decoder(target), []
-    for task in tasks:
-        world = spec_of(task).open_world(task, settings.camera, settings.horizon)
-        try:
-            outcomes += [run_episode(world, decoder, seed).success for seed in seeds]
-        finally:
-            world.close()
-    return float(np.mean(outcomes))
+    decoder = native_decoder(target)
+    try:
+        every = itertools.product(tasks, seeds)
+        return float(np.mean([run_episode(open_world(task, settings), decoder, seed).success for task, seed in every]))
+    finally:
+        close_worlds()

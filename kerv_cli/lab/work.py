@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from kerv_cli.base.errors import CheckpointError, EpisodeError, KervError, StorageError
 from kerv_cli.base.registry import ArtifactPart
@@ -32,8 +32,6 @@ from kerv_cli.lab.runs import Presence, Run, bury
 from kerv_cli.lab.store import Study, loaded, rows_of
 from kerv_cli.lab.study import Plan
 from kerv_cli.targets.provenance import stamp
-
-T = TypeVar("T")
 
 POLL_SECONDS = 1.0
 """Seconds between two queries of the queue while other processes run all blocks that are left."""

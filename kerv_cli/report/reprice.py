@@ -62,7 +62,7 @@ def repriced(data: StudyData, profiles: Sequence[NamedProfile], lenient: bool = 
     """Estimate how fast every setting that decodes would be on the machine of each profile.
 
     Args:
-        lenient: Leave out a profile that lacks a cost, and settings without times, instead of raising an error.
+        lenient: Leave out a profile that lacks a cost instead of raising an error.
     """
     if not profiles:
         return []
