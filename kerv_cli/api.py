@@ -117,8 +117,8 @@ def sweep(study: str | Path, *overrides: str, **settings: object) -> Study:
 
     Args:
         study: Name of a file in conf/study, or the path of such a file.
-        *overrides: Settings as text, such as `"episodes=5"`. They apply to each of the study's settings.
-        **settings: The same as keywords.
+        *overrides: Overrides as text, such as `"episodes=5"`, for everything that the study compares.
+        **settings: Overrides as keyword arguments.
 
     Raises:
         KervError: Some episodes failed. All complete episodes are kept. Other errors are those of `rollout`.

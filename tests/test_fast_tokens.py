@@ -59,7 +59,7 @@ def test_what_needs_a_code_is_refused_for_bins(parts):
         chosen(**{"acceptance": "strict", **parts}).decoder(MockTarget(SEVEN, 4, seed=2), lambda kind: None)
 
 
-def test_lookup_drafts_what_followed_in_the_last_chunk_and_loses_nothing():
+def test_lookup_drafts_what_followed_in_earlier_chunks_and_loses_nothing():
     proposer = LookupProposer(LookupProposerSettings())
     plain = Decoder(TARGET)
     fast = Decoder(TARGET, Parts(prefill_draft=proposer, proposer=proposer))
@@ -70,13 +70,14 @@ def test_lookup_drafts_what_followed_in_the_last_chunk_and_loses_nothing():
         accepted += sum(one.accepted for one in record.rounds)
     assert accepted
     chunk = fast._new_chunk(TARGET.encode(shown(0)))
-    chunk.episode.last = [5, 6, 7, 5, 6, 8, 9]
+    chunk.episode.decoded[:] = [[3, 5, 6, 2, 4], [5, 6, 7, 5, 6, 8, 9]]
     for committed, drafted in (
         ([], [5, 6, 7]),
         ([5, 6], [7, 5, 6]),
         ([1, 5, 6], [7, 5, 6]),
         ([1, 1, 1, 5, 6], [8, 9]),
         ([7, 9, 1], [5, 6, 8]),
+        ([3, 5, 6], [2, 4]),
     ):
         chunk.tokens[:] = committed
         assert proposer.chains(chunk, 3) == [drafted]

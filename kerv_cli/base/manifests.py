@@ -109,7 +109,7 @@ def content_of(key: Sequence[str], chunk: int, target: str, files: Mapping[str, 
 
 
 def check_files(folder: Path, files: Mapping[str, str], again: str) -> None:
-    """Check that the files in a folder still have their SHA-256. `again` tells in the error what to do if not."""
+    """Check that the files in a folder still have their SHA-256. `again` ends the error: how to make them anew."""
     for name, digest in files.items():
         if sha256_of(folder / name) != digest:
             raise CheckpointError(f"{folder / name} does not match its manifest: {again}")

@@ -45,7 +45,7 @@ DEVICES = {
 
 
 class Needs(NamedTuple):
-    """What a phase of a decode needs on any device."""
+    """Work of one phase of a decode, which is the same on every device."""
 
     read: float
     flops: float

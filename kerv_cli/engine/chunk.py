@@ -40,7 +40,7 @@ class Follower:
         cameras: Names of the cameras whose images the decoder reads.
         task: Name of the running episode's task.
         path: Measured positions of the end effector, (3,) each, metres, oldest first.
-        last: Tokens of the chunk that was decoded last.
+        decoded: Tokens of each chunk that was decoded in this episode, oldest first.
         planned: The last chunk's normalised actions (D,) that are not executed yet.
     """
 
@@ -49,7 +49,7 @@ class Follower:
         self._start("", [])
 
     def _start(self, task: str, path: list[np.ndarray]) -> None:
-        self.task, self.path, self.last, self.planned = task, path, list[int](), list[np.ndarray]()
+        self.task, self.path, self.decoded, self.planned = task, path, list[list[int]](), list[np.ndarray]()
         self._executed = np.zeros((0, self.space.dofs))
 
     def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:

@@ -147,7 +147,8 @@ class Decoder(Follower):
 
         chunk = self.decode_prompt(encode, stopwatch)
         actions = chunk.actions()
-        self.last, self.planned = chunk.tokens, [*chunk.values(self.target.chunk)]
+        self.decoded.append(chunk.tokens)
+        self.planned = [*chunk.values(self.target.chunk)]
         measure = self.threshold.measure
         self.threshold.update(chunk.variability if measure == MEAN else variability(chunk.rounds, self.space, measure))
         if self.parts.rectifier is not None:
@@ -352,9 +353,8 @@ def greedy(target: Target, prompt: Tensor) -> tuple[Tensor, Tensor]:
         prompt: The prompts' embeddings (B, P, E).
 
     Returns:
-        The decoded tokens (B, N), where N is the largest number that a chunk of the target can have: after an end
-        token, all are end tokens. The hidden states (B, P + N − 1, E) of the prompt and of all decoded tokens but the
-        last.
+        The decoded tokens (B, N), where N is the largest number of tokens in a chunk: end tokens fill shorter chunks.
+        The hidden states (B, P + N − 1, E) of the prompt and of all decoded tokens but the last.
     """
     length, size = prompt.shape[1], target.actions.longest(target.chunk)
     cache = target.new_cache(len(prompt), length + size)

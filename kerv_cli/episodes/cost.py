@@ -205,8 +205,8 @@ def work_of_record(decode: DecodeRecord) -> Work:
 def prices(work: Work, profile: Profile) -> np.ndarray:
     """Estimate the seconds of each decode, (decodes,).
 
-    The profile gives the seconds of forwards and of the drafter's drafts. It also gives the seconds of other proposers'
-    drafts, if it has their times. Everything else keeps its recorded seconds.
+    Forwards and the drafter's drafts take the profile's seconds. So do other proposers' drafts, if the profile lists
+    them. Everything else keeps its recorded seconds.
     """
     total = np.array(work.host, dtype=float)
     again = work.again.items() if profile.about.get(EXTRA_ROUND) else ()

@@ -90,8 +90,8 @@ def plan(
 ) -> Plan:
     """Find out which episodes of a sweep or a rollout are in the database, and which must run.
 
-    Each call plans a new rollout, unless the same command was interrupted before. Then the rest of its newest rollout
-    is planned.
+    For a rollout, each call plans a new one. If the same command was interrupted before, the rest of its newest rollout
+    is planned instead.
 
     Args:
         resolved: The study with all its settings.

@@ -215,7 +215,8 @@ def work_on(study: Study, run: str, on_event: OnEvent, save: Save) -> None:
 def checked(setting: Setting, tasks: list[str], results: str, is_awaited: bool = False) -> Setting:
     """Check that the weights and data that a stored setting uses are still the same.
 
-    Return the setting, changed to run in the folder `results`. `is_awaited` is explained in `policy.check`.
+    Return the setting, changed to run in the folder `results`. With `is_awaited`, a server that does not answer is
+    tried for two minutes.
     """
     here = replace(setting, settings={**setting.settings, "results": results})
     identity = check(here.on(*tasks), is_awaited)

@@ -64,23 +64,24 @@ class LookupProposerSettings:
 
 @ProposerPart("lookup", LookupProposerSettings, colour=0xB5651D, when=PREFILL, chains=True, any_code=True)
 class LookupProposer(ChainProposer):
-    """Searches the last chunk for the newest committed tokens, and drafts the tokens that followed there.
+    """Searches the episode's earlier chunks for the newest committed tokens, and drafts the tokens that followed there.
 
-    If the newest `longest` tokens do not occur, fewer are searched for. If they occur several times, the occurrence
-    nearest to the current index in the chunk wins. If nothing is found, or no token is committed yet, the draft is the
-    last chunk's tokens from the current index on.
+    The newest chunk that has them wins. If it has them several times, the occurrence nearest to the current index in
+    the chunk wins. If the newest `longest` tokens do not occur, fewer are searched for. If nothing is found, or no
+    token is committed yet, the draft is the last chunk's tokens from the current index on.
     """
 
     name = "lookup"
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:
-        last, tokens = chunk.episode.last, chunk.tokens
+        earlier, tokens = chunk.episode.decoded, chunk.tokens
         for size in range(min(self.settings.longest, len(tokens)), 0, -1):
-            places = [place for place in range(size, len(last)) if last[place - size : place] == tokens[-size:]]
-            if places:
-                nearest = min(places, key=lambda place: abs(place - len(tokens)))
-                return [last[nearest:][:depth]]
-        return [last[len(tokens) :][:depth]]
+            for one in reversed(earlier):
+                places = [place for place in range(size, len(one)) if one[place - size : place] == tokens[-size:]]
+                if places:
+                    nearest = min(places, key=lambda place: abs(place - len(tokens)))
+                    return [one[nearest:][:depth]]
+        return [earlier[-1][len(tokens) :][:depth]] if earlier else [[]]
 
 
 @ProposerPart("last_action", NoSettings, colour=0x2CA25F, when=PREFILL, chains=True, any_code=True)

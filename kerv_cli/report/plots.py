@@ -50,7 +50,7 @@ Places = Mapping[str, tuple[str, float | None]]
 
 
 class Panel(NamedTuple):
-    """One of the charts side by side."""
+    """One chart in a row of charts."""
 
     title: str
     points: Sequence[Point]  # A point without x is drawn as a line across the panel

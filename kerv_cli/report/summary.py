@@ -206,7 +206,7 @@ def _heading(name: str) -> str:
 
 
 def _parts(rows: Sequence[Cells], names: Sequence[str], width: int) -> Iterator[list[str]]:
-    """Cut a table's columns into parts of at most `width` characters. The first part has label, success and speed."""
+    """Split a table into several of at most `width` characters, each with some columns. The first has the success."""
     widths = {name: 2 + max(map(len, [*_heading(name).split("\n"), *(row[name] for row in rows)])) for name in names}
     labels = " ".join(row["setting"] for row in rows)
     label = min(widths["setting"], 2 + max(_LABEL, *map(len, labels.split())))

@@ -76,7 +76,7 @@ def choose(rows: Sequence[Result], loss: float) -> Choice:
 
 
 def safest_first(rows: Sequence[Result]) -> list[Result]:
-    """Return the rows of the settings to test, the safest first (`safety`). Equally safe ones keep the study's order.
+    """Return the rows that the verdict tests, the safest first (`safety`). Equally safe ones keep the study's order.
 
     Settings that are not faster than the baseline are left out. So are settings without a measured speed, unless no
     setting has one: then success alone decides.
@@ -149,7 +149,7 @@ def sentence(choice: Choice, loss: float, baseline: str) -> str:
 
 
 def order_of(by_speed: Sequence[tuple[str, stats.Estimate]]) -> str:
-    """Return the settings as text in the order of their speed per episode. `≈`: either may be faster.
+    """Return the settings as text, ordered by their speed per episode. `≈` joins two that are not shown to differ.
 
     Args:
         by_speed: The settings, the fastest first, each with its speed relative to the next slower setting.

@@ -33,8 +33,8 @@ class Cache:
         buffer: (layers, 2, B, A, slots, C) keys and values. A fixed cache has a spare slot after its capacity.
         layers: (2, B, A, slots, C) per layer, views of the buffer.
         length: Number of cached tokens. They are in the first slots.
-        copied: Number of first slots that are already copied to the memory that `copies` returns. If it exceeds
-            `length`, the copies after the first `length` slots are out of date.
+        copied: Number of first slots whose copies are in the memory that `copies` returns. Only the first `length`
+            copies are valid.
     """
 
     fixed = False
@@ -111,12 +111,12 @@ def attention_mask(seen: Seen, tokens: int, cache: Cache | None, like: Tensor) -
     Args:
         seen: (T, M) bool, which of the last M tokens each new token attends to. The last M tokens are the M − T newest
             cached tokens, then the T new tokens. Each new token also attends to all earlier cached tokens. If None,
-            attention is causal. A tensor must be on the device of `like`.
+            attention is causal. If it is a tensor, it must be on the device of `like`.
         tokens: T, number of new tokens.
         like: Tensor whose device and number format the mask gets.
 
     Returns:
-        The mask (T, S + T), or (T, all slots) for a cache of fixed shapes. None if no mask is needed.
+        The mask (T, S + T) for S cached tokens, or (T, all slots) for a cache of fixed shapes. None if not needed.
     """
     cached, fixed = (cache.length, cache.fixed) if cache is not None else (0, False)
     stop = cached + tokens

@@ -205,7 +205,7 @@ def reference_level(records: Sequence[DecodeRecord], actions: ActionSpace, chunk
 
 
 def episode_decodes(decoder: Decoder, dataset: DemoDataset, index: int, decodes: int) -> list[DecodeRecord]:
-    """Decode observations that are spread evenly over one demonstration. Decodes without a compared draft are left out.
+    """Decode observations spread evenly over one demonstration. Leave out decodes in which no draft was verified.
 
     The decoder also gets every action executed in between, because some methods use a history.
     """

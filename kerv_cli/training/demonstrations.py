@@ -179,7 +179,7 @@ class PolicyActor:
 
 @dataclass(frozen=True)
 class PolicyActs:
-    """Makes the `PolicyActor` of a recording, in the process that records. `PolicyActs` itself holds no weights.
+    """Is sent to the process that records, and makes a `PolicyActor` there. It holds no weights itself.
 
     Attributes:
         sha256: Hash of the method and all its weights.

@@ -340,7 +340,7 @@ class World(ABC):
         return float(values[names.index("gripper")]) if "gripper" in names else 1.0
 
     def reset(self, seed: int) -> Observation:
-        """Start the episode of a seed of 0 or more, and return the first observation.
+        """Start the episode of `seed`, which is at least 0, and return the first observation.
 
         A stress draws a new disturbance.
         """

@@ -62,7 +62,7 @@ class RetrievalProposerSettings:
     any_code=True,
 )
 class RetrievalProposer(ChainProposer):
-    """Drafts the task's most similar stored chunks, merged into one tree (docs/methods.md §4.2)."""
+    """Drafts the stored chunks of the most similar observations of the task, as one tree (docs/methods.md §4.2)."""
 
     name = "retrieval"
 

@@ -109,5 +109,5 @@ class BoundaryRanges:
         return alpha * radius + (1 - alpha) * length
 
     def of_path(self, points: np.ndarray, alpha: float) -> float:
-        """Return F of a path (n, 3) in metres: alpha · scaled radius + (1 − alpha) · scaled length."""
+        """Return F of a path (n, 3) in metres: alpha · radius of curvature + (1 − alpha) · length, both scaled."""
         return self.fused(radius_of_curvature(points), path_length(points), alpha)

@@ -209,7 +209,7 @@ class Datastore:
         return Neighbours(similarity, chunks, self.seeds[rows], self.steps[rows], self.left[rows])
 
     def candidates(self, key: np.ndarray, shard: slice, k: int, without: int | None) -> np.ndarray:
-        """Return, in ascending order, all rows that may be among the k most similar, given float32 rounding errors."""
+        """Return ascending numbers of all rows that can be among the k most similar, given float32 rounding errors."""
         scores = self.vectors[shard] @ key
         if without is not None:
             scores[self.seeds[shard] == without] = -np.inf

@@ -42,7 +42,7 @@ def mlp(*widths: int) -> nn.Sequential:
 
 
 def relative(vector: Tensor) -> Tensor:
-    """Return features (…, 6) of vectors (…, 3) in metres: vector / 0.1 m, then tanh(vector / 0.02 m)."""
+    """Return features (…, 6) of vectors v (…, 3) in metres: v / 0.1 m (3 numbers) and tanh(v / 0.02 m) (3 numbers)."""
     return torch.cat([vector / COARSE, torch.tanh(vector / FINE)], -1)
 
 

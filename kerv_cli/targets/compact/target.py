@@ -204,7 +204,7 @@ class CompactTarget(Compilable):
         return self.prompt(*given)
 
     def prompt(self, words: Tensor, proprioception: Tensor, *seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the prompts and positions of `encode_batch`, computed by the PyTorch modules.
+        """Compute what `encode_batch` returns with PyTorch's modules instead of compiled code.
 
         Args:
             words: (B, L) ids of words.

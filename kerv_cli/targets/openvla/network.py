@@ -113,7 +113,7 @@ class VisionTower(nn.Module):
         self.blocks = nn.ModuleList(Block(tower) for _ in range(tower.depth - 1))
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """Map normalised images (B, 3, h, w) to patch tokens (B, n, W). Only patches get position embeddings."""
+        """Map normalised images (B, 3, h, w) to patch tokens (B, n, W). Other tokens get no position embeddings."""
         x = self.patch_embed(pixels).flatten(2).transpose(1, 2) + self.pos_embed
         if self.prefix:
             front = torch.cat([self.cls_token, self.reg_token], 1).expand(len(x), -1, -1)
