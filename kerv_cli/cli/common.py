@@ -37,7 +37,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON o
 
 
 def end_with_json(value: object, code: int = 0) -> NoReturn:
-    """Print a value as indented JSON and end the command. NaN and infinity become null, a data frame its rows."""
+    """Print a value as indented JSON and end the command. NaN and infinity become null."""
     typer.echo(json.dumps(_plain(value), indent=2, ensure_ascii=False))
     raise typer.Exit(code)
 
@@ -47,8 +47,6 @@ def _plain(value: object) -> object:
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
-    if hasattr(value, "to_dict"):  # a data frame
-        return _plain(value.to_dict("records"))
     if hasattr(value, "item"):  # a number of numpy
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
@@ -172,16 +170,15 @@ def database_of(settings: CommandSettings) -> Database:
     return opened(settings.results)
 
 
-@contextmanager
-def made(plan: Plan[T], database: Database, show: bool = False, as_json: bool = False) -> Iterator[T]:
-    """Carry out a plan, and yield its result. With `show`, only print the plan and its duration, and end."""
+def make(plan: Plan[T], database: Database, show: bool = False, as_json: bool = False) -> T:
+    """Carry out a plan, and return its result. With `show`, only print the plan and its duration, and end."""
     from kerv_cli.lab import runs
 
     if show:
         time = f"about {duration(plan.seconds())}" if plan.seconds else "time unknown"
         end_with_plan(f"{plan.text}, {time} ({plan.source})", as_json)
     with runs.making(database, plan.kind, plan.folder) as run:
-        yield plan.make(lambda title: progress_bar(title, run))
+        return plan.make(lambda title: progress_bar(title, run))
 
 
 @contextmanager

@@ -5,11 +5,12 @@ from __future__ import annotations
 from hashlib import sha256
 from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from kerv_cli.base.errors import CheckpointError, KervError, UsageError
+from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.paths import results_dir
 from kerv_cli.base.registry import DRAFTING
@@ -22,12 +23,12 @@ from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.episodes.cost import Profile, prices, read_profile, work_of_record
 from kerv_cli.episodes.episode import Latency, RealClock
 from kerv_cli.episodes.identity import OBSERVATION
-from kerv_cli.episodes.interface import read_interface
+from kerv_cli.episodes.interface import STATE, read_interface
 from kerv_cli.episodes.remote import RemoteDecoder, metadata_of
 from kerv_cli.episodes.settings import MEASURED, PROFILE, REAL, WAITS, RolloutSettings
 from kerv_cli.methods.artifacts import Artifacts, Use
 from kerv_cli.methods.compose import Method
-from kerv_cli.methods.settings import EXPERT, MODEL, REMOTE, MethodSettings
+from kerv_cli.methods.settings import EXPERT, MODEL, REMOTE
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.spec import EnvironmentSpec
@@ -37,7 +38,8 @@ PRIVILEGED = "state (privileged)"
 WARM_UP_DECODES = 6
 
 
-def artifacts_of(settings: MethodSettings) -> Artifacts:
+def artifacts_of(settings: Any) -> Artifacts:
+    """Return the artifacts of a command's `results` and `policy`, for its `runtime`, which is set up."""
     device, _ = set_up(settings.runtime)
     return Artifacts(settings.results, settings.policy, device, settings.runtime.dtype)
 
@@ -50,7 +52,9 @@ def check(settings: RolloutSettings, is_awaited: bool = False) -> dict[str, str]
     """
     tasks = resolve_tasks(settings.task)
     spec = spec_of(tasks[0])
-    _check_seeds(settings, spec)
+    purpose = "selection" if settings.seed in spec.seeds.selection else "evaluation"
+    seeds = range(settings.seed, settings.seed + settings.episodes)
+    spec.seeds.check(seeds, purpose, f"seed={settings.seed} episodes={settings.episodes}")
     spec.check_stress(settings.world.stress)
     if settings.policy.kind != MODEL:
         _check_undecoded(settings)
@@ -82,19 +86,13 @@ def check(settings: RolloutSettings, is_awaited: bool = False) -> dict[str, str]
     return {**hashes, **profile, OBSERVATION: observation}
 
 
-def _check_seeds(settings: RolloutSettings, spec: EnvironmentSpec) -> None:
-    seeds = range(settings.seed, settings.seed + settings.episodes)
-    purpose = "selection" if settings.seed in spec.seeds.selection else "evaluation"
-    spec.seeds.check(seeds, purpose, f"seed={settings.seed} episodes={settings.episodes}")
-
-
 def _check_remote(settings: RolloutSettings, spec: EnvironmentSpec, is_awaited: bool) -> dict[str, str]:
     metadata = metadata_of(settings.policy.url, is_awaited)
     interface = read_interface(settings.policy.interface).adapted(metadata, settings.policy.execute)
     interface.check(spec, settings.world)
     server = sha256(packed({"name": settings.policy.target, "metadata": metadata}))
     reads = sha256(repr(interface).encode())
-    observation = PRIVILEGED if interface.is_privileged else "vision"
+    observation = PRIVILEGED if any(STATE in names for names in interface.state.values()) else "vision"
     return {"target": "", "server": server.hexdigest(), "interface": reads.hexdigest(), OBSERVATION: observation}
 
 
@@ -207,14 +205,12 @@ class ExpertDecoder(Follower):
     def __init__(self, task: str) -> None:
         spec = spec_of(task)
         super().__init__(spec.actions, ())
-        self.task, self.expert = task, spec.expert(task)
+        self.expert = spec.expert(task)
 
     def decode(self, observation: Observation) -> DecodeRecord:
         """Return a record with the action of one control step, (1, D), environment units."""
         stopwatch = Stopwatch(torch.device("cpu"))
         action = self.expert(observation)
         seconds = stopwatch.stop()
-        if action.shape != (self.space.dofs,) or not np.isfinite(action).all():
-            raise KervError(f"the expert of {self.task} answered {action} to a state it cannot read")
         actions = action[None].astype(np.float32)
         return DecodeRecord((), actions, 0, (), EXPERT, seconds, stopwatch.phases)

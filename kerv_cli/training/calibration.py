@@ -23,22 +23,23 @@ from kerv_cli.base.files import write_json
 from kerv_cli.base.manifests import stamped
 from kerv_cli.base.paths import check_free
 from kerv_cli.base.registry import find
-from kerv_cli.base.runtime import set_up
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.decoder import Decoder, Stopwatch
 from kerv_cli.engine.record import MEAN, MEASURES, DecodeRecord, variability
+from kerv_cli.episodes.policy import artifacts_of
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database
 from kerv_cli.methods import calibration as stored
-from kerv_cli.methods.artifacts import Artifacts, MadeFor
+from kerv_cli.methods.artifacts import MadeFor
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.heisd.curvature import BoundaryRanges
 from kerv_cli.methods.heisd.datastore import Datastore
 from kerv_cli.methods.kerv.prediction import Noise, kalman_weights
+from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.targets.observations import check_tail, observations_of
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_tasks, demos_for
-from kerv_cli.training.fit import FEW
+from kerv_cli.training.fit import FEW, timed
 from kerv_cli.training.settings import CalibrateSettings, Plan, Stage
 from kerv_cli.worlds import resolve_tasks
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
@@ -60,25 +61,45 @@ RATIOS = np.logspace(-3, 3, 49)
 Calibrated = tuple[Path, stored.Calibration, list[str]]  # its file, and a line per section that was not measured
 
 
-@dataclass(frozen=True)
-class CalibrationWork:
-    """Measures a calibration and writes its JSON file, after `plan_calibration` has checked the settings."""
+def plan_calibration(settings: CalibrateSettings, database: Database) -> Plan[Calibrated]:
+    """Check the settings and the artifacts of a calibration, and return the plan to measure it.
 
-    settings: CalibrateSettings
-    artifacts: Artifacts
-    dataset: DemoDataset
-    chosen: list[int]  # episodes
-    tasks: tuple[str, ...]
-    missing: list[str]  # kinds of artifacts without which sections are left out
-    path: Path
+    `Plan.make` returns the file's path, the calibration, and a line per section that was not measured: no K_S if
+    `decodes` is 0 or the drafter is missing, no skip levels without a datastore.
+    """
+    artifacts = artifacts_of(settings)
+    target, device = artifacts.description, artifacts.device
+    target.check_autoregressive("kerv calibrate", "there is no draft to calibrate")
+    settings, dataset = demos_for(settings, target, database)
+    tasks = resolve_tasks(settings.task or list(dataset.manifest.tasks))
+    chosen = choose_episodes(dataset, tasks, settings.episodes)
+    drafting().check(target)
+    missing = [kind for kind in ("drafter", "datastore") if not artifacts.exists(kind)]
+    artifacts.check({"datastore"} - set(missing))
+    path = artifacts.new("calibration")
+    check = partial(check_free, path, "policy.artifacts.calibration", settings.replace)
+    without = f"; without {' and '.join(missing)}" if missing else ""
+    text = (
+        f"{path}: predictors fitted on {count(len(chosen), 'demonstration')} of {count(len(tasks), 'task')}; "
+        f"{settings.decodes} decodes per task; boundary over {', '.join(map(str, settings.boundary_windows))} "
+        f"positions{without}"
+    )
+    measures_k = settings.decodes > 0 and "drafter" not in missing
+    windows = partial(read_windows, dataset, target, settings.window)
 
-    def __call__(self, stage: Stage) -> Calibrated:
-        settings, dataset, target = self.settings, self.dataset, self.artifacts.description
+    def work(stage: Stage) -> Calibrated:
         with stage("reading demonstrations") as progress:
-            past, future, paths, counts = read_windows(
-                dataset, self.chosen, target.actions, settings.window, target.chunk, progress
-            )
-        variability, skip = self.variability(stage), self.skip(stage)
+            past, future, paths, counts = windows(chosen, progress)
+        variability: dict[str, stored.Variability] = {}
+        skip: stored.SkipSection | None = None
+        if measures_k:
+            decoder = drafting().decoder(artifacts.target, artifacts.load)
+            with stage("pre-sampling") as progress:
+                variability = presample(decoder, dataset, chosen, settings.decodes, progress)
+        if "datastore" not in missing:
+            store = artifacts.load("datastore")
+            with stage("skip levels") as progress:
+                skip = skip_section(store, tasks, settings.epsilon, settings.confidence, progress)
         with stage("boundary ranges") as progress:
             boundary = fit_boundary(paths, settings.boundary_windows, progress)
         with stage("fitting the predictors"):
@@ -91,76 +112,26 @@ class CalibrationWork:
             variability=variability,
             boundary=boundary,
             skip=skip,
-            provenance=provenance_of("kerv calibrate", settings, self.artifacts.device),
+            provenance=provenance_of("kerv calibrate", settings, device),
         )
-        write_json(self.path, stamped(asdict(calibration)))
-        no_drafter = ", no drafter" if "drafter" in self.missing else ""
+        write_json(path, stamped(asdict(calibration)))
+        no_drafter = ", no drafter" if "drafter" in missing else ""
         notes = [] if variability else [f"no reference levels K_S: decodes={settings.decodes}{no_drafter}"]
         notes += [] if skip else ["no skip levels: no datastore of these tasks (kerv build datastore)"]
-        return self.path, calibration, notes
+        return path, calibration, notes
 
-    def seconds(self) -> float:
-        """Estimate the seconds of a calibration from a few demonstrations and, with a drafter, from two decodes."""
-        settings, chosen, target = self.settings, self.chosen[:FEW], self.artifacts.description
-        clock = Stopwatch(torch.device(self.artifacts.device))
-        _, _, paths, _ = read_windows(self.dataset, chosen, target.actions, settings.window, target.chunk, _silent)
-        fit_boundary(paths, settings.boundary_windows, _silent)
-        total = clock.stop() * len(self.chosen) / len(chosen)
-        if settings.decodes and "drafter" not in self.missing:
-            decoder, times = drafting().decoder(self.artifacts.target, self.artifacts.load), list[float]()
-            for _ in range(2):  # the first time includes compiling
-                clock = Stopwatch(torch.device(self.artifacts.device))
-                decodes = episode_decodes(decoder, self.dataset, chosen[0], 2)
-                times.append(clock.stop())
-            total += min(times) * settings.decodes * len(self.tasks) / max(1, len(decodes))
+    def seconds() -> float:
+        # from a few demonstrations and, with a drafter, from two decodes
+        few, clock = chosen[:FEW], Stopwatch(torch.device(device))
+        fit_boundary(windows(few, lambda *done: None)[2], settings.boundary_windows, lambda *done: None)
+        total = clock.stop() * len(chosen) / len(few)
+        if measures_k:
+            decoder = drafting().decoder(artifacts.target, artifacts.load)
+            of_two, decodes = timed(device, lambda: episode_decodes(decoder, dataset, few[0], 2))
+            total += of_two * settings.decodes * len(tasks) / max(1, len(decodes))
         return total
 
-    def variability(self, stage: Stage) -> dict[str, stored.Variability]:
-        if not self.settings.decodes or "drafter" in self.missing:
-            return {}
-        decoder = drafting().decoder(self.artifacts.target, self.artifacts.load)
-        with stage("pre-sampling") as progress:
-            return presample(decoder, self.dataset, self.chosen, self.tasks, self.settings.decodes, progress)
-
-    def skip(self, stage: Stage) -> stored.SkipSection | None:
-        if "datastore" in self.missing:
-            return None
-        store, settings = self.artifacts.load("datastore"), self.settings
-        with stage("skip levels") as progress:
-            return skip_section(store, self.tasks, settings.epsilon, settings.confidence, progress)
-
-
-def _silent(done: int, total: int) -> None:
-    pass
-
-
-def plan_calibration(settings: CalibrateSettings, database: Database) -> Plan[Calibrated]:
-    """Check the settings and the artifacts of a calibration, and return the plan to measure it.
-
-    `Plan.make` returns the file's path, the calibration, and a line per section that was not measured: no K_S if
-    `decodes` is 0 or the drafter is missing, no skip levels without a datastore.
-    """
-    device, _ = set_up(settings.runtime)
-    artifacts = Artifacts(settings.results, settings.policy, device=device, dtype=settings.runtime.dtype)
-    target = artifacts.description
-    target.check_autoregressive("kerv calibrate", "there is no draft to calibrate")
-    settings, dataset = demos_for(settings, target, database)
-    tasks = resolve_tasks(settings.task or list(dataset.manifest.tasks))
-    chosen = choose_episodes(dataset, tasks, settings.episodes)
-    drafting().check(target)
-    missing = [kind for kind in ("drafter", "datastore") if not artifacts.exists(kind)]
-    artifacts.check({"datastore"} - set(missing))
-    path = artifacts.new("calibration")
-    check = partial(check_free, path, "policy.artifacts.calibration", settings.replace)
-    check()
-    without = f"; without {' and '.join(missing)}" if missing else ""
-    text = (
-        f"{path}: predictors fitted on {count(len(chosen), 'demonstration')} of {count(len(tasks), 'task')}; "
-        f"{settings.decodes} decodes per task; boundary over {', '.join(map(str, settings.boundary_windows))} "
-        f"positions{without}"
-    )
-    work = CalibrationWork(settings, artifacts, dataset, chosen, tasks, missing, path)
-    return Plan("calibration", path, text, work, check, work.seconds)
+    return Plan("calibration", path, text, work, check, seconds)
 
 
 def drafting() -> Method:
@@ -168,14 +139,9 @@ def drafting() -> Method:
 
 
 def presample(
-    decoder: Decoder,
-    dataset: DemoDataset,
-    chosen: Sequence[int],
-    tasks: Sequence[str],
-    decodes: int,
-    progress: OnProgress,
+    decoder: Decoder, dataset: DemoDataset, chosen: Sequence[int], decodes: int, progress: OnProgress
 ) -> dict[str, stored.Variability]:
-    variability = {}
+    variability, tasks = {}, list(dict.fromkeys(dataset.episodes[index].task for index in chosen))
     for number, name in enumerate(tasks, 1):
         records: list[DecodeRecord] = []
         for index in chosen:
@@ -249,7 +215,7 @@ def episode_windows(episode: DemoEpisode, actions: ActionSpace, window: int, hor
 
 
 def read_windows(
-    dataset: DemoDataset, chosen: Sequence[int], actions: ActionSpace, window: int, horizon: int, progress: OnProgress
+    dataset: DemoDataset, target: TargetDescription, window: int, chosen: Sequence[int], progress: OnProgress
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray], dict[str, dict[str, int]]]:
     """Read the expert's actions around n moments (control steps) of episodes, see `episode_windows`.
 
@@ -263,7 +229,7 @@ def read_windows(
     parts, paths = [], []
     for done, index in enumerate(chosen, 1):
         episode = dataset.load(index)
-        parts.append(episode_windows(episode, actions, window, horizon))
+        parts.append(episode_windows(episode, target.actions, window, target.chunk))
         paths.append(episode.end_effector.copy())
         counts.setdefault(episode.task, {"training": 0})["training"] += bool(len(parts[-1]))
         progress(done, len(chosen))
@@ -275,10 +241,7 @@ def read_windows(
 
 def choose_episodes(dataset: DemoDataset, tasks: Sequence[str], limit: int) -> list[int]:
     check_tasks(dataset, tasks)
-    chosen: list[int] = []
-    for task in tasks:
-        chosen += dataset.of_tasks(task)[: limit or None]
-    return chosen
+    return [index for task in tasks for index in dataset.of_tasks(task)[: limit or None]]
 
 
 def fit_noise(past: np.ndarray, future: np.ndarray) -> float:

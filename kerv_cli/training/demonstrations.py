@@ -21,14 +21,13 @@ from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import visible
 from kerv_cli.base.paths import artifact, artifact_or_path
-from kerv_cli.base.runtime import device_of, set_up
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.episodes.identity import hash_of
+from kerv_cli.episodes.policy import artifacts_of
 from kerv_cli.episodes.settings import DEFAULT_TASKS
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import command_to_go_on
-from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.settings import EXPERT, PolicySettings
 from kerv_cli.targets.checkpoint import TargetDescription
@@ -192,7 +191,7 @@ class PolicyActs:
     def of(cls, settings: DemosSettings, spec: EnvironmentSpec) -> PolicyActs:
         """Check that the policy can act in an environment. Recordings may have more views than the target sees."""
         name, world = settings.policy.target, settings.world
-        description = _artifacts(settings).description
+        description = artifacts_of(settings).description
         description.check_world(name, spec.name, spec.actions, world.camera.size)
         views = [spec.camera_name(view) for view in description.cameras]
         camera = spec.camera_name(world.camera.name)
@@ -205,23 +204,17 @@ class PolicyActs:
         return cls(settings, _hash(settings))
 
     def __call__(self, config: DemoConfig) -> PolicyActor:
-        set_up(self.settings.runtime)
         if _hash(self.settings) != self.sha256:
             raise CheckpointError(
                 f"the policy {self.settings.policy.target} has changed since the recording began: record under another "
                 "name="
             )
-        artifacts, method = _artifacts(self.settings), Method.of(self.settings)
+        artifacts, method = artifacts_of(self.settings), Method.of(self.settings)
         return PolicyActor(lambda task: method.decoder(artifacts.target, artifacts.load, task), config.expert_share)
 
 
-def _artifacts(settings: DemosSettings) -> Artifacts:
-    runtime = settings.runtime
-    return Artifacts(settings.results, settings.policy, device_of(runtime), runtime.dtype)
-
-
 def _hash(settings: DemosSettings) -> str:
-    hashes = _artifacts(settings).check(Method.of(settings).needs)
+    hashes = artifacts_of(settings).check(Method.of(settings).needs)
     format = [] if settings.runtime.dtype == "float32" else [settings.runtime.dtype]
     return hash_of([hashes, {kind: asdict(part) for kind, part in settings.parts().items()}, settings.chunk, *format])
 
@@ -244,7 +237,6 @@ def plan_demos(settings: DemosSettings) -> Plan[tuple[Path, DemoManifest]]:
         with stage("demonstrations") as advance:
             return folder, record(config, folder, advance, actor)
 
-    check()
     text = f"{count(len(config.tasks), 'task')} x {count(settings.episodes, 'episode')} -> {folder}"
     rate, processes = RATES.get(config.spec.name), config.workers
     if rate is None or actor is not None:

@@ -14,13 +14,12 @@ import sys
 import threading
 import time
 import zipfile
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any, ClassVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -32,9 +31,10 @@ from kerv_cli.base.runtime import set_up
 from kerv_cli.engine.decoder import Stopwatch
 from kerv_cli.episodes.identity import hash_of
 from kerv_cli.targets.provenance import provenance_of
-from kerv_cli.training.settings import Plan, Stage, TrainSettings
+from kerv_cli.training.settings import Stage, TrainSettings
 from kerv_cli.worlds.demos.dataset import DemoDataset
 
+T = TypeVar("T")
 Metrics = dict[str, float]
 # Takes the number of an optimisation step. Returns the loss (a scalar) of that step's batch, and metrics to log.
 Loss = Callable[[int], tuple[Tensor, Metrics]]
@@ -308,15 +308,20 @@ class Destination:
 FEW = 4  # episodes from which `--plan` makes the samples to measure
 
 
+def timed(device: torch.device | str, action: Callable[[], T]) -> tuple[float, T]:
+    """Call a function twice. Return the seconds and the result of the second call; the first loads and compiles."""
+    for _ in range(2):
+        clock = Stopwatch(torch.device(device))
+        result = action()
+        seconds = clock.stop()
+    return seconds, result
+
+
 def seconds_of(loss: Loss, settings: TrainSettings, device: torch.device) -> float:
-    """Estimate how long all steps of a training take, from three of them. The first one counts as warm-up."""
-    times = []
+    """Estimate how long all steps of a training take, from two of them. The first one counts as warm-up."""
     with without_subnormals():
-        for step in range(settings.scene_steps, settings.scene_steps + 3):
-            clock = Stopwatch(device)
-            loss(step)[0].backward()
-            times.append(clock.stop())
-    return settings.steps * min(times[1:])
+        of_step, _ = timed(device, lambda: loss(settings.scene_steps)[0].backward())
+    return settings.steps * of_step
 
 
 def read_state(path: Path) -> dict[str, Any]:
@@ -334,44 +339,35 @@ def read_state(path: Path) -> dict[str, Any]:
 
 # Takes a folder, a network and the provenance of its weights, and writes them
 Write = Callable[[Path, Any, dict[str, Any]], object]
-Ready = tuple[nn.Module, Loss, Validate, Write]
+Made = tuple[nn.Module, Loss, Validate, Write]
+# Takes demonstrations and a progress function. Makes the network, and its samples from the demonstrations.
+Ready = Callable[[DemoDataset, Callable[..., None]], Made]
 
 
-@dataclass(frozen=True)
-class Training(ABC):
-    """Base class of trainings, after their settings were checked. A subclass makes the network and the samples."""
+def train(
+    settings: Any, dataset: DemoDataset, place: Destination, command: str, reading: str, ready: Ready, stage: Stage
+) -> tuple[Path, Metrics]:
+    """Carry out a training whose settings were checked. Return its folder and the metrics of the best weights.
 
-    settings: Any
-    dataset: DemoDataset
-    place: Destination
-    command: ClassVar[str]
-    reading: ClassVar[str]  # title of the stage that makes the samples
+    Args:
+        settings: Settings of the command, with `train` and `runtime`.
+        dataset: The demonstrations.
+        place: Where to write.
+        command: The command, for the provenance of the weights.
+        reading: Title of the stage in which `ready` makes the samples.
+        ready: Makes the network and the samples.
+        stage: Shows the stages.
+    """
+    provenance = provenance_of(command, settings, set_up(settings.runtime)[0])
+    with place.opened() as folder, without_subnormals():
+        with stage(reading) as progress:
+            network, loss, validate, write = ready(dataset, progress)
 
-    @abstractmethod
-    def ready(self, dataset: DemoDataset, progress: Callable[..., None]) -> Ready:
-        """Make the network, and its samples from demonstrations."""
+        def save(network: Any, metrics: Metrics) -> None:
+            demos = {"sha256": dataset.sha256, "config": dataset.manifest.config}
+            size = sum(parameter.numel() for parameter in network.parameters())
+            write(folder, network, {**provenance, "demos": demos, "validation": metrics, "parameters": size})
 
-    @abstractmethod
-    def seconds(self) -> float:
-        """Estimate the seconds of the whole training, from a few steps."""
-
-    def plan(self, kind: str, text: str) -> Plan[tuple[Path, Metrics]]:
-        self.place.check()
-        folder = self.place.folder
-        return Plan(kind, folder, f"{folder}: {text}", self.work, self.place.check, self.seconds)
-
-    def work(self, stage: Stage) -> tuple[Path, Metrics]:
-        settings, dataset, place = self.settings, self.dataset, self.place
-        provenance = provenance_of(self.command, settings, set_up(settings.runtime)[0])
-        with place.opened() as folder, without_subnormals():
-            with stage(self.reading) as progress:
-                network, loss, validate, write = self.ready(dataset, progress)
-
-            def save(network: Any, metrics: Metrics) -> None:
-                demos = {"sha256": dataset.sha256, "config": dataset.manifest.config}
-                size = sum(parameter.numel() for parameter in network.parameters())
-                write(folder, network, {**provenance, "demos": demos, "validation": metrics, "parameters": size})
-
-            with stage("training") as progress:
-                metrics = fit(network, loss, validate, save, settings.train, folder, place.identity, progress)
-        return place.folder, metrics
+        with stage("training") as progress:
+            metrics = fit(network, loss, validate, save, settings.train, folder, place.identity, progress)
+    return place.folder, metrics

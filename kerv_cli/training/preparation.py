@@ -60,13 +60,10 @@ def plan(settings: PrepareSettings, database: Database) -> list[Step]:
 @functools.cache
 def needs(methods: tuple[str, ...]) -> tuple[str, ...]:
     """Return the kinds of artifacts that the methods need, in the order in which they must be made."""
-    artifacts = ArtifactPart.every()
     kinds: set[str] = set()
     for name in methods or groups()["method"]:
         kinds.update(Method.of(compose("rollout", [f"method={name}"], RolloutSettings)).needs)
-    order: list[str] = []
-    for kind, part in artifacts.items():
-        order += [*part.needed(None), kind]
+    order = [name for kind, part in ArtifactPart.every().items() for name in (*part.needed(None), kind)]
     possible = [kind for kind in dict.fromkeys(order) if kind in kinds]
     return tuple(kind for kind in possible if kind_of(kind).command)
 

@@ -41,7 +41,7 @@ class Plan(Generic[T]):
         path: Folder of the artifact, or the file of a calibration.
         text: What would be made, for `--plan`.
         work: Function that makes the artifact, and shows its stages.
-        check: Function that refuses to replace existing files. `make` calls it again before `work`.
+        check: Function that refuses to replace existing files. It is called at once, and by `make` before `work`.
         seconds: Function that estimates the seconds of `work`, for `--plan`. None if they cannot be estimated.
         source: What the estimate is based on, or why there is none.
     """
@@ -53,6 +53,9 @@ class Plan(Generic[T]):
     check: Callable[[], object]
     seconds: Callable[[], float] | None = None
     source: str = "from a few steps, measured now"
+
+    def __post_init__(self) -> None:
+        self.check()
 
     @property
     def folder(self) -> Path:

@@ -7,10 +7,9 @@ weights are best. Shapes: B samples of a batch, N tokens of a chunk, H control s
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,11 +37,10 @@ from kerv_cli.targets.observations import Observations, read_chunks, read_observ
 from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.training import fit
 from kerv_cli.training.demonstrations import check_spaces, check_tasks, name_of, open_demos, seen_by
-from kerv_cli.training.settings import Plan, TrainSettings, TrainTargetSettings, refuse_unused
+from kerv_cli.training.settings import Plan, Stage, TrainSettings, TrainTargetSettings, refuse_unused
 from kerv_cli.worlds import resolve_tasks, settled, spec_of, specs
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.files import DemoEpisode
-from kerv_cli.worlds.settings import WorldSettings
 
 STATE_EPISODES = 200  # maximum number of episodes from which the range of the states is measured
 # Validation reports the share of tokens at most this many bins from the label. It is Spec-VLA's acceptance radius.
@@ -51,39 +49,6 @@ WITHIN = 9
 # gripper next changes, and at the end of the episode. No state contains them, so their index 0 is never used.
 WAYPOINTS = (Place("waypoint 1", 0), Place("waypoint 2", 0))
 VALIDATED = 2048  # maximum number of samples in a validation
-
-
-@dataclass(frozen=True)
-class TargetTraining(fit.Training):
-    """The training of a compact policy, after `plan_target` has checked the settings."""
-
-    tasks: tuple[str, ...]
-    world: WorldSettings
-    init: Path | None  # folder of the target whose weights it starts from
-    command = "kerv train target"
-    reading = "reading demonstrations"
-
-    def ready(self, dataset: DemoDataset, progress: OnProgress) -> fit.Ready:
-        train, (device, _), tasks = self.settings.train, set_up(self.settings.runtime), self.tasks
-        target, samples = load_training(self.settings, dataset, tasks, self.init, self.world.camera.name, progress)
-        seeds = spec_of(tasks[0]).seeds.selection[: train.closed_loop]
-        success = functools.partial(success_of, tasks=tasks, seeds=seeds, settings=self.world) if seeds else None
-        imitation = Imitation(target.to(device), samples, train, success)
-        draw = fit.batches(len(imitation.training), train, imitation.weights)
-        states = functools.cache(lambda: state_range(dataset))
-
-        def write(folder: Path, target: CompactTarget, provenance: dict[str, Any]) -> None:
-            made = provenance | origin_of(self.init)
-            save_target(folder, target, dataset.manifest.environment, made, train.stored, states())
-
-        return target, lambda step: imitation.loss(draw(step), step), imitation.validate, write
-
-    def seconds(self) -> float:
-        """Estimate the seconds of all steps, from a few steps on demonstrations of one task."""
-        chosen = self.dataset.of_tasks(self.tasks[0])[: fit.FEW]
-        few = replace(self.dataset, episodes=[self.dataset.episodes[index] for index in chosen])
-        target, loss, *_ = self.ready(few, lambda *done: None)
-        return fit.seconds_of(loss, self.settings.train, next(target.parameters()).device)
 
 
 def plan_target(settings: TrainTargetSettings, database: Database) -> Plan[tuple[Path, fit.Metrics]]:
@@ -120,7 +85,33 @@ def plan_target(settings: TrainTargetSettings, database: Database) -> Plan[tuple
         f"{count(len(dataset.of_tasks(*tasks)), 'demonstration')} of {count(len(tasks), 'task')}, "
         f"{count(train.steps, 'step')} of {train.batch} samples{start}"
     )
-    return TargetTraining(settings, dataset, place, tasks, world, init).plan("target", text)
+
+    def ready(dataset: DemoDataset, progress: OnProgress) -> fit.Made:
+        device, _ = set_up(settings.runtime)
+        target, samples = load_training(settings, dataset, init, world.camera.name, progress)
+        seeds = spec.seeds.selection[: train.closed_loop]
+        success = functools.partial(success_of, tasks=tasks, seeds=seeds, settings=world) if seeds else None
+        imitation = Imitation(target.to(device), samples, train, success)
+        draw = fit.batches(len(imitation.training), train, imitation.weights)
+        states = functools.cache(lambda: state_range(dataset))
+
+        def write(folder: Path, target: CompactTarget, provenance: dict[str, Any]) -> None:
+            made = provenance | origin_of(init)
+            save_target(folder, target, dataset.manifest.environment, made, train.stored, states())
+
+        return target, lambda step: imitation.loss(draw(step), step), imitation.validate, write
+
+    def seconds() -> float:
+        # from a few steps on demonstrations of one task
+        chosen = dataset.of_tasks(tasks[0])[: fit.FEW]
+        few = replace(dataset, episodes=[dataset.episodes[index] for index in chosen])
+        target, loss, *_ = ready(few, lambda *done: None)
+        return fit.seconds_of(loss, train, next(target.parameters()).device)
+
+    def work(stage: Stage) -> tuple[Path, fit.Metrics]:
+        return fit.train(settings, dataset, place, "kerv train target", "reading demonstrations", ready, stage)
+
+    return Plan("target", folder, f"{folder}: {text}", work, place.check, seconds)
 
 
 def origin_of(init: Path | None) -> dict[str, str]:
@@ -174,12 +165,7 @@ def initial_target(settings: TrainTargetSettings, camera: str, new: Path) -> Pat
 
 
 def load_training(
-    settings: TrainTargetSettings,
-    dataset: DemoDataset,
-    tasks: tuple[str, ...],
-    init: Path | None,
-    camera: str,
-    progress: OnProgress,
+    settings: TrainTargetSettings, dataset: DemoDataset, init: Path | None, camera: str, progress: OnProgress
 ) -> tuple[CompactTarget, Samples]:
     """Read the demonstrations into memory, and make the network, with the weights in `init` if that is not None."""
     manifest, shapes, old = dataset.manifest, settings.target, None
@@ -191,7 +177,7 @@ def load_training(
     elif not observation.places:
         observation = observation.without_state(WAYPOINTS)
     waypoints = len(observation.places) if settings.train.places == "path" else 0
-    samples = load_samples(dataset, shapes, words, tasks, progress, waypoints)
+    samples = load_samples(dataset, shapes, words, resolve_tasks(settings.task), progress, waypoints)
     torch.manual_seed(settings.train.seed)
     if old is None:
         actions = manifest.actions.fitted(samples.chunks[:, 0].numpy().astype(np.float64))
@@ -313,27 +299,18 @@ class Imitation:
         self.labels = labels_of(target.actions, settings.label_sigma).to(self.device)
         self.weights = task_weights(self.training.tasks, settings.balance)
         self.learns_places = bool(target.cameras and settings.scene_weight)
+        gpu = self.device.type != "cpu"
+        # CPUs without AMX or AVX512-BF16 are slower in bfloat16
+        multiplies = gpu or torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported()
+        self.bf16 = settings.bf16 and multiplies
+        self.kernels = [SDPBackend.MATH]
+        if gpu or not self.bf16:  # on a CPU, the backward pass of a fused kernel in bfloat16 takes four times as long
+            self.kernels += [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION]
 
     def tokens(self, batch: Samples) -> Tensor:
         tokens = self.module.actions.chunk_tokens(batch.chunks.numpy())
         lengths = (tokens != self.module.actions.end).sum(1) + 1
         return torch.from_numpy(tokens[:, : lengths.max()]).to(self.device)
-
-    @contextlib.contextmanager
-    def precision(self) -> Iterator[None]:
-        """Compute in bfloat16 inside this context, if `train.bf16` is set and the device multiplies bfloat16 numbers.
-
-        CPUs without AMX or AVX512-BF16 are slower in bfloat16. On a CPU, attention runs without a fused kernel in
-        bfloat16, because that kernel's backward pass takes four times as long.
-        """
-        gpu = self.device.type != "cpu"
-        multiplies = gpu or torch.cpu._is_amx_tile_supported() or torch.cpu._is_avx512_bf16_supported()
-        bf16 = self.settings.bf16 and multiplies
-        kernels = [SDPBackend.MATH]
-        if gpu or not bf16:
-            kernels += [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION]
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=bf16), sdpa_kernel(kernels):
-            yield
 
     def loss(self, indices: Tensor, step: int) -> tuple[Tensor, fit.Metrics]:
         """Return the loss of the samples `indices` (B,), and the metrics to log."""
@@ -341,7 +318,7 @@ class Imitation:
         inputs = batch.inputs(self.device)
         if self.settings.colour and inputs.images is not None:
             inputs = replace(inputs, images=lit(inputs.images, indices, step, self.settings.colour))
-        with self.precision():
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bf16), sdpa_kernel(self.kernels):
             places = batch.places.to(self.device)
             if self.learns_places and step < self.settings.scene_steps:
                 loss = position_loss(self.module.encode_batch(inputs)[1], places)
@@ -385,8 +362,7 @@ class Imitation:
             f"within_{WITHIN}": float((distance <= WITHIN).float().mean()),
             "action_l1": float(error.mean()),
         }
-        for name, one in zip(actions.names, error, strict=True):
-            metrics[f"l1_{name}"] = float(one)
+        metrics |= {f"l1_{name}": float(one) for name, one in zip(actions.names, error, strict=True)}
         if self.learns_places:
             medians = torch.cat(offsets).median(0).values.tolist()
             for number, place in enumerate(module.observation.places):

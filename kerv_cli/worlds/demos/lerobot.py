@@ -94,9 +94,8 @@ class Source:
         camera = camera or next(iter(keys))
         camera_file = [f"videos/{keys[camera]}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
         columns = ["episode_index", "length", "data/chunk_index", "data/file_index", *camera_file]
-        rows: list[Row] = []
-        for path in sorted(folder.glob("meta/episodes/[!.]*/[!.]*.parquet")):
-            rows += _table(path, columns).to_pylist()
+        paths = sorted(folder.glob("meta/episodes/[!.]*/[!.]*.parquet"))
+        rows: list[Row] = [row for path in paths for row in _table(path, columns).to_pylist()]
         if not rows:
             raise CheckpointError(f"{folder / 'meta/episodes'} is missing or names no episode: copy the dataset again")
         rows.sort(key=itemgetter("episode_index"))

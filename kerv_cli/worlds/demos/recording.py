@@ -140,19 +140,6 @@ def record(
     identity, begun = check_recording(config, out), out / "recording.json"
     if not begun.exists():
         write_json(begun, identity)
-    entries, failed = _collect(config, out, on_progress, make_actor)
-    empty = [task for task, rows in entries.items() if not rows]
-    if empty:
-        raise KervError(f"no expert episode succeeded within {config.horizon} steps for {', '.join(empty)}")
-    missing = config.episodes * len(config.tasks) - sum(map(len, entries.values()))
-    manifest = {**identity, **totals(entries, failed, missing)}
-    write_json(out / "manifest.json", manifest)
-    return read(DemoManifest, manifest, str(out / "manifest.json"))
-
-
-def _collect(
-    config: DemoConfig, out: Path, on_progress: OnProgress, make_actor: MakeActor | None
-) -> tuple[dict[str, list[EpisodeEntry]], dict[str, list[int]]]:
     entries: dict[str, list[EpisodeEntry]] = {task: [] for task in config.tasks}
     failed: dict[str, list[int]] = {task: [] for task in config.tasks}
     seeds = dict.fromkeys(config.tasks, range(config.first_seed, config.first_seed + config.episodes))
@@ -173,7 +160,13 @@ def _collect(
         for task, block in seeds.items():
             stop = block.stop + config.episodes - len(entries[task])
             seeds[task] = range(block.stop, min(stop, limit))
-    return entries, failed
+    empty = [task for task, rows in entries.items() if not rows]
+    if empty:
+        raise KervError(f"no expert episode succeeded within {config.horizon} steps for {', '.join(empty)}")
+    missing = config.episodes * len(config.tasks) - sum(map(len, entries.values()))
+    manifest = {**identity, **totals(entries, failed, missing)}
+    write_json(out / "manifest.json", manifest)
+    return read(DemoManifest, manifest, str(out / "manifest.json"))
 
 
 def _identity(config: DemoConfig) -> dict[str, Any]:
