@@ -38,7 +38,9 @@ def _converted(kind: Any, value: Any, place: str, tolerant: bool) -> Any:
     # `place` is the keys that lead to the value, such as "tasks.reach-v3."
     origin, args = get_origin(kind), get_args(kind)
     if kind is Any or (value is None and NoneType in args) or type(value) is kind:
-        return value if kind is not float else _finite(value, place)
+        if kind is float and not math.isfinite(value):
+            raise KervError(f"{place[:-1]}: {value} is not finite")
+        return value
     if kind is float and type(value) is int:
         return float(value)
     if origin is UnionType:
@@ -56,12 +58,6 @@ def _converted(kind: Any, value: Any, place: str, tolerant: bool) -> Any:
             every = enumerate(zip(kinds, value, strict=True))
             return origin(_converted(one, item, f"{place}{i}.", tolerant) for i, (one, item) in every)
     raise KervError(f"{place[:-1]}: {str(value)[:40]!r} is no {getattr(kind, '__name__', kind)}".removeprefix(": "))
-
-
-def _finite(value: float, place: str) -> float:
-    if not math.isfinite(value):
-        raise KervError(f"{place[:-1]}: {value} is not finite")
-    return value
 
 
 def _instance(kind: Any, value: Mapping[str, Any], place: str, tolerant: bool) -> Any:

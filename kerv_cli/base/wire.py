@@ -58,9 +58,7 @@ def unpacked(frame: bytes | str) -> Message:
 
 def _value(value: dict[Any, Any]) -> object:
     # a PNG or JPEG image becomes a function that decodes it when called, because most images are never used
-    items = {}
-    for key, item in value.items():
-        items[key.decode() if isinstance(key, bytes) else key] = item
+    items = {key.decode() if isinstance(key, bytes) else key: item for key, item in value.items()}
     data, name = items.get("data"), items.get("dtype")
     if items.get("__image__") and items.get("format") != "raw":
         return functools.partial(_image, data)

@@ -83,11 +83,10 @@ def few(names: Sequence[str], most: int = 3) -> str:
 
 def find_runs(database: Database) -> list[RunEntry]:
     """Return all entries of a database and its results folder, newest first."""
-    folder, found = database.results / "artifacts", {}
+    folder = database.results / "artifacts"
     for name in ("studies", "rollouts"):
         clean(database.results / name)
-    for one in _studies(database):
-        found[one.kind, one.folder.name] = one
+    found = {(one.kind, one.folder.name): one for one in _studies(database)}
     for kind in artifact_kinds():
         clean(folder / kind)
         for path in visible(folder / kind):
@@ -131,17 +130,12 @@ def find_run(database: Database, name: str, exact: bool = False) -> RunEntry:
         raise UsageError(f"no runs in {database.results}: make one with 'kerv rollout method=spec_vla task=reach'")
     if name == LAST and not exact:
         return runs[0]
-    found: dict[str, RunEntry] = {}
-    for one in runs:
-        if one.id == name:
-            return one
-        if name in one.id and not exact:
-            found[one.id] = one
+    found = [one for one in runs if one.id == name] or [one for one in runs if name in one.id and not exact]
     if len(found) > 1:
-        raise UsageError(f"'{name}' is a part of {len(found)} runs: {', '.join(list(found)[:5])}")
+        raise UsageError(f"'{name}' is a part of {len(found)} runs: {', '.join(one.id for one in found[:5])}")
     if not found:
         raise UnknownName("run", name, map(attrgetter("id"), runs))
-    return next(iter(found.values()))
+    return found[0]
 
 
 def matching(runs: Sequence[RunEntry], filters: dict[str, str]) -> list[RunEntry]:
@@ -199,21 +193,17 @@ def _studies(database: Database) -> Iterator[RunEntry]:
                 for kind, value in one.identity.items():
                     if kind != OBSERVATION and value and value not in made_from.values():
                         made_from[f"{kind} of {one.label}" if kind in made_from else kind] = value
-        total = successes = existing = 0
-        names, times = [], []
-        for one in tasks:
-            if one.study_id == study.id:
-                total, existing, successes = total + one.all, existing + one.existing, successes + (one.successes or 0)
-                names.append(one.task)
-                times.append(one.started)
+        mine = [one for one in tasks if one.study_id == study.id]
+        total, existing = sum(one.all for one in mine), sum(one.existing for one in mine)
+        successes = sum(one.successes or 0 for one in mine)
         yield RunEntry(
             id=study.name,
             kind=study.kind,
             folder=Study(database, study.name, study.kind).root,
-            started=min(filter(None, times), default=study.created)[:23],
+            started=min(filter(None, (one.started for one in mine)), default=study.created)[:23],
             state=COMPLETE if existing == total else f"{existing} of {total} episodes",
             methods=tuple(methods),
-            tasks=tuple(names),
+            tasks=tuple(one.task for one in mine),
             episodes=existing,
             total=total,
             done=existing,
@@ -248,8 +238,7 @@ def artifact_entry(folder: Path, kind: str) -> RunEntry:
         provenance = dict(value.get("provenance") or {})
         settings = dict(provenance.get("settings") or {})
         figures = {name: float(value[name]) for name in ("episodes", "rows") if isinstance(value.get(name), int)}
-        for name, number in dict(provenance.get("validation") or {}).items():
-            figures[name] = float(number)
+        figures |= {name: float(number) for name, number in dict(provenance.get("validation") or {}).items()}
         sha256 = str(value.get("sha256") or (sha256_of(_description(folder, kind)) if value else ""))
         state = "complete" if value or (folder / WEIGHTS).is_file() else "begun"  # copied weights have no description
         if (folder / LOG).is_file():

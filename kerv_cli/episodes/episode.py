@@ -91,7 +91,7 @@ class _Execution:
         self.actions: list[np.ndarray] = []  # (D,) float32, within the limits
         self.path: list[np.ndarray] = []
         self.gripper: list[float] = []
-        self.distances: list[float] = []  # between hand and object, after each step
+        self.distances: list[float] = []  # between hand and object, after each step, metres; NaN without an object
         self.objects: list[np.ndarray] = []  # (3,) position of the object, after each step
         self.frames: dict[int, np.ndarray] = {}
         self.places: dict[str, list[np.ndarray]] = {}
@@ -113,8 +113,8 @@ class _Execution:
         space = self.world.spec.actions
         self.actions.append(np.clip(self.last, space.low, space.high).astype(np.float32))
         self._collect()
-        self.distances.append(self.world.object_distance)
         self.objects.append(self.world.object_position)
+        self.distances.append(float(np.linalg.norm(self.world.grip_point - self.objects[-1])))
         self.follower.observe(self.actions[-1], self.path[-1])
 
     def until(self, rest: int) -> None:

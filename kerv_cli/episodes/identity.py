@@ -98,9 +98,8 @@ def hash_of(value: object) -> str:
 
 def work_of(settings: Plain, identity: Identity) -> str:
     """Return the hash of all that determines results except task and seed: settings, weights, data and ENGINE."""
-    policy = {"kind": settings["policy"]["kind"]}
-    for name, value in without(identity, {OBSERVATION}).items():
-        policy[f"{name}_sha256"] = value
+    hashes = {f"{name}_sha256": value for name, value in without(identity, {OBSERVATION}).items()}
+    policy = {"kind": settings["policy"]["kind"], **hashes}
     return hash_of({"settings": determining(settings), "policy": policy, "engine": ENGINE})
 
 

@@ -77,11 +77,6 @@ class Interface:
     def cameras(self) -> tuple[str, ...]:
         return tuple(dict.fromkeys(one.camera for one in self.images.values()))
 
-    @property
-    def is_privileged(self) -> bool:
-        """Whether the policy reads the simulator's whole state."""
-        return any(STATE in names for names in self.state.values())
-
     def check(self, spec: EnvironmentSpec, world: WorldSettings) -> None:
         """Refuse an environment that lacks what the server reads, or has other DoFs than the server's actions."""
         if self.environment not in ("", spec.name):

@@ -48,11 +48,8 @@ class Point:
 
     @classmethod
     def of(cls, name: str, overrides: Sequence[str], varied: Collection[str]) -> Point:
-        varies = {}
-        for override in overrides:
-            key, value = override.lstrip("+").split("=", 1)
-            if key in varied:
-                varies[key] = value
+        pairs = (override.lstrip("+").split("=", 1) for override in overrides)
+        varies = {key: value for key, value in pairs if key in varied}
         return cls(name, tuple(overrides), varies, tuple(overrides))
 
     @property
@@ -99,13 +96,8 @@ def resolve(overrides: Sequence[str]) -> ResolvedStudy:
 
     Settings of `kerv sweep` configure the sweep. `results` and all other overrides apply to every setting of the study.
     """
-    of_sweep, of_settings = [], []
-    for override in overrides:
-        is_of_sweep = _key(override).split(".")[0] in SweepSettings.__dataclass_fields__
-        if is_of_sweep:
-            of_sweep.append(override)
-        if not is_of_sweep or override.startswith("results="):
-            of_settings.append(override)
+    of_sweep = [one for one in overrides if _key(one).split(".")[0] in SweepSettings.__dataclass_fields__]
+    of_settings = [one for one in overrides if one not in of_sweep or one.startswith("results=")]
     sweep = compose("sweep", of_sweep, SweepSettings)
     files = dict(override.split("=", 1) for override in of_sweep)
     study, path = sweep.study, preset_file("study", files.get("study", SweepSettings.groups["study"]))
@@ -339,17 +331,14 @@ def located(words: Sequence[str]) -> list[str]:
     return found
 
 
-def _outranked(overrides: Iterable[str], by: Sequence[str]) -> list[str]:
+def _outranked(overrides: Sequence[str], by: Sequence[str]) -> list[str]:
     _, others = _parted(overrides, set(map(_key, by)))
     return [*others, *by]
 
 
-def _parted(overrides: Iterable[str], keys: Collection[str]) -> tuple[list[str], list[str]]:
-    named: list[str] = []
-    others: list[str] = []
-    for override in overrides:
-        (named if _key(override) in keys else others).append(override)
-    return named, others
+def _parted(overrides: Sequence[str], keys: Collection[str]) -> tuple[list[str], list[str]]:
+    named = [one for one in overrides if _key(one) in keys]
+    return named, [one for one in overrides if _key(one) not in keys]
 
 
 def _key(override: str) -> str:

@@ -175,11 +175,9 @@ def decode_records(table: pa.Table) -> list[DecodeRecord]:
 
 
 def _round(values: dict[str, Any]) -> Round:
-    plain: dict[str, Any] = {}
-    for name, value in values.items():
-        if value is not None:  # episodes from before a field existed have None there
-            plain[name] = tuple(value) if isinstance(value, list) else value
-    return Round(**plain)
+    # episodes from before a field existed have None there
+    given: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
+    return Round(**given | {name: tuple(value) for name, value in given.items() if isinstance(value, list)})
 
 
 def _decode_record(row: dict[str, Any]) -> DecodeRecord:
@@ -187,10 +185,7 @@ def _decode_record(row: dict[str, Any]) -> DecodeRecord:
     filled = set(range(len(tokens) if row["compensated"] else 0))  # a rectifier filled what no round committed
     for one in rounds:
         filled.difference_update(range(one.start, one.start + one.committed))
-    phases = {}
-    for phase in PHASES:
-        if row[f"seconds.{phase}"] is not None:
-            phases[phase] = row[f"seconds.{phase}"]
+    phases = {phase: row[f"seconds.{phase}"] for phase in PHASES if row[f"seconds.{phase}"] is not None}
     late = itemgetter("delay_seconds", "delay_steps", "observed", "carried", "held", "dropped")
     return DecodeRecord(
         tokens=tokens,

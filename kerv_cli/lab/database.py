@@ -31,6 +31,12 @@ SCHEMA = "2"
 """Version of the tables. A database with another version is refused."""
 LOCK_SECONDS = 60
 """Longest time to wait for another process's transaction in a SQLite file, seconds."""
+STATEMENT_SECONDS = 30
+"""Longest time that a statement may take on PostgreSQL, waiting for other transactions included, seconds."""
+IDLE_SECONDS = 20
+"""Longest time between two statements of a transaction on PostgreSQL, which may hold locks, seconds."""
+CONNECT_SECONDS = 5
+"""Longest time to wait for a connection to PostgreSQL, seconds."""
 
 _META = sa.MetaData()
 
@@ -245,7 +251,10 @@ class Database:
                 version = _version(connection)
             if version is None:
                 with engine.execution_options(kerv_writes=True).begin() as connection:
-                    version = _created(connection)
+                    if _version(connection) is None:  # no other process has created the tables meanwhile
+                        _META.create_all(connection)
+                        connection.execute(sa.insert(ABOUT).values(key="schema_version", value=SCHEMA))
+                    version = _version(connection)
             if version != SCHEMA:
                 engine.dispose()
                 raise CheckpointError(
@@ -320,13 +329,19 @@ def clock(connection: sa.Connection) -> sa.ColumnElement[float]:
 @functools.cache
 def _server(url: sa.URL) -> sa.Engine:
     try:
-        from kerv_cli.lab.postgresql import connect
+        engine = sa.create_engine(url, pool_pre_ping=True)
     except ModuleNotFoundError:
         raise UsageError("store=postgresql:// needs the package psycopg: pip install 'kerv[postgres]'") from None
-    engine = sa.create_engine(url, pool_pre_ping=True)
-    sa.event.listen(engine, "do_connect", connect)
+    sa.event.listen(engine, "do_connect", _limit)
     sa.event.listen(engine, "begin", _begin)
     return engine
+
+
+def _limit(dialect: object, record: object, arguments: object, options: dict[str, Any]) -> None:
+    """Set the time limits of a new connection to PostgreSQL."""
+    limits = f"-c statement_timeout={STATEMENT_SECONDS}s -c idle_in_transaction_session_timeout={IDLE_SECONDS}s"
+    options |= {"connect_timeout": CONNECT_SECONDS, "options": limits, "keepalives_idle": 10, "keepalives_interval": 5}
+    options |= {"keepalives_count": 2, "tcp_user_timeout": 20_000}
 
 
 _begun = threading.local()
@@ -398,12 +413,3 @@ def _version(connection: sa.Connection) -> Any:
     if not sa.inspect(connection).has_table(ABOUT.name):
         return None
     return connection.scalar(sa.select(ABOUT.c.value).where(ABOUT.c.key == "schema_version"))
-
-
-def _created(connection: sa.Connection) -> Any:
-    """Create the tables, if no other process has done so in the meantime. Return the version of their schema."""
-    version = _version(connection)
-    if version is None:
-        _META.create_all(connection)
-        connection.execute(sa.insert(ABOUT).values(key="schema_version", value=SCHEMA))
-    return SCHEMA if version is None else version

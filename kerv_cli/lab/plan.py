@@ -89,12 +89,8 @@ class Block:
         return sorted(set(map(attrgetter("seed"), self.episodes)))
 
     @property
-    def name(self) -> str:
-        return f"{self.task} {seeds_text(self.seeds)}"
-
-    @property
     def title(self) -> str:
-        return f"{self.name}: {count(len(self.settings), 'setting')} in turn"
+        return f"{self.task} {seeds_text(self.seeds)}: {count(len(self.settings), 'setting')} in turn"
 
     def turns(self) -> Iterator[Episode]:
         """Yield the episodes in the order in which they run.
@@ -114,8 +110,8 @@ def split(
     block: int,
     stored: Mapping[Key, Sequence[Any]],
     known: Mapping[Episode, Any],
-    rerun: str = NEVER,
-    earlier: Mapping[str, Setting] | None = None,
+    rerun: str,
+    earlier: Mapping[str, Setting],
 ) -> tuple[dict[Episode, int], dict[Episode, str]]:
     """Divide a study's episodes into existing and missing ones.
 
@@ -140,30 +136,20 @@ def split(
         usable[one] = [] if is_anew else linked or rows
     _keep_whole_orders(usable, block)
     existing = {one: max(row.id for row in rows) for one, rows in usable.items() if rows}
-    return existing, _reasons(episodes, stored, existing, rerun, earlier or {})
-
-
-def _reasons(
-    episodes: Sequence[Episode],
-    stored: Mapping[Key, Sequence[Any]],
-    existing: Mapping[Episode, int],
-    rerun: str,
-    earlier: Mapping[str, Setting],
-) -> dict[Episode, str]:
     works, tasks = {work for work, _, _ in stored}, {(work, task) for work, task, _ in stored}
     change = functools.cache(lambda setting: differences(setting, earlier.get(setting.label)))
-    reasons = {}
+    missing = {}
     for one in episodes:
         if one in existing:
             continue
         if stored.get(one.key):
             is_ordered = one.setting.depends_on_order and rerun != ALL
-            reasons[one] = "order of episodes" if is_ordered else "rerun=all"
+            missing[one] = "order of episodes" if is_ordered else "rerun=all"
         elif one.key[:2] in tasks:
-            reasons[one] = "new seeds"
+            missing[one] = "new seeds"
         else:
-            reasons[one] = "new task" if one.setting.work in works else change(one.setting)
-    return reasons
+            missing[one] = "new task" if one.setting.work in works else change(one.setting)
+    return existing, missing
 
 
 def grouped(episodes: Iterable[Episode], key: Callable[[Episode], K]) -> dict[K, list[Episode]]:
@@ -238,7 +224,4 @@ def seeds_text(seeds: Iterable[int]) -> str:
             runs[-1][1] = seed
         else:
             runs.append([seed, seed])
-    texts = []
-    for first, last in runs:
-        texts.append(str(first) if first == last else f"{first}-{last}")
-    return ";".join(texts)
+    return ";".join(str(first) if first == last else f"{first}-{last}" for first, last in runs)

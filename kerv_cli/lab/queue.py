@@ -71,9 +71,8 @@ class Queue:
     def __init__(self, study: Study, worker: str, run: str = "") -> None:
         self.study, self.worker, self.run, self.database = study, worker, run, study.database
         with self.database.reading() as connection:
-            number = connection.scalar(sa.select(STUDIES.c.id).where(STUDIES.c.name == study.name))
-        self._of_study = sa.and_(WANTED.c.study_id == (number or 0), UNFINISHED)
-        self.number = number or 0
+            self.number = connection.scalar(sa.select(STUDIES.c.id).where(STUDIES.c.name == study.name)) or 0
+        self._of_study = sa.and_(WANTED.c.study_id == self.number, UNFINISHED)
         self._settings: dict[int, Setting] = {}
 
     def claim(self) -> Claim | None:

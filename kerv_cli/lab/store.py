@@ -195,21 +195,20 @@ def stored_episodes(connection: sa.Connection, study: Study) -> dict[Key, list[A
 
 def counts_of(study: Study) -> tuple[int, int]:
     """Return how many of the study's planned episodes have been run, and how many episodes are planned."""
-    with study.database.reading() as connection:
-        row = connection.execute(
-            sa.select(sa.func.count(WANTED.c.episode_id), sa.func.count())
-            .select_from(PLANNED)
-            .where(STUDIES.c.name == study.name)
-        ).one()
-    return int(row[0]), int(row[1])
+    done, total, _ = _facts(study)
+    return int(done), int(total)
 
 
 def version_of(study: Study) -> str:
     """Return a text that changes whenever episodes of the study are added, replaced or removed."""
-    facts = sa.func.count(), sa.func.count(WANTED.c.episode_id), sa.func.sum(WANTED.c.episode_id)
+    return "/".join(map(str, _facts(study)))
+
+
+def _facts(study: Study) -> Sequence[Any]:
+    facts = sa.func.count(WANTED.c.episode_id), sa.func.count(), sa.func.sum(WANTED.c.episode_id)
     query = sa.select(*facts).select_from(PLANNED).where(STUDIES.c.name == study.name)
     with study.database.reading() as connection:
-        return "/".join(map(str, connection.execute(query).one()))
+        return connection.execute(query).one()
 
 
 def _same_episode() -> sa.ColumnElement[bool]:

@@ -58,10 +58,6 @@ class Plan:
         """The episodes to run, grouped into blocks. One process runs a block. Blocks are ordered by first episode."""
         return blocks_of(self.to_run, self.study.block)
 
-    @property
-    def is_elsewhere(self) -> bool:
-        return is_elsewhere(self.runtime)
-
 
 def is_elsewhere(runtime: RuntimeSettings) -> bool:
     return bool(runtime.launch) or not runtime.workers
@@ -155,15 +151,11 @@ def plan_study(
             if setting is not None and setting.work == row.work:
                 known[Episode(setting, row.task, row.seed)] = row
         stored = stored_episodes(connection, study)
-        earlier = _earlier(connection, study.labels)
+        ran = sa.select(WANTED.c.setting_id).where(WANTED.c.episode_id.is_not(None))
+        of_labels = sa.select(SETTINGS).where(SETTINGS.c.label.in_(study.labels), SETTINGS.c.id.in_(ran))
+        earlier = {row.label: setting_of(row) for row in connection.execute(of_labels.order_by(SETTINGS.c.id))}
     existing, missing = split(study.episodes, study.block, stored, known, rerun, earlier)
     return Plan(study, existing, missing, rerun == ALL, runtime or RuntimeSettings(), tuple(command))
-
-
-def _earlier(connection: sa.Connection, labels: Sequence[str]) -> dict[str, Setting]:
-    ran = sa.select(WANTED.c.setting_id).where(WANTED.c.episode_id.is_not(None))
-    query = sa.select(SETTINGS).where(SETTINGS.c.label.in_(labels), SETTINGS.c.id.in_(ran)).order_by(SETTINGS.c.id)
-    return {row.label: setting_of(row) for row in connection.execute(query)}
 
 
 def save(plan: Plan, run: str = "") -> None:

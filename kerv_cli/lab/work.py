@@ -11,7 +11,7 @@ import os
 import secrets
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -30,7 +30,7 @@ from kerv_cli.lab.plan import Block, Episode, seeds_text
 from kerv_cli.lab.queue import MOST_DEATHS, Claim, ClaimLost, Queue, patiently
 from kerv_cli.lab.runs import Presence, Run, bury
 from kerv_cli.lab.store import Study, loaded, rows_of
-from kerv_cli.lab.study import Plan
+from kerv_cli.lab.study import Plan, is_elsewhere
 from kerv_cli.targets.provenance import stamp
 
 POLL_SECONDS = 1.0
@@ -156,7 +156,7 @@ def follow(plan: Plan, record: Run, tend: Tend, prepare: Prepare, on_event: OnEv
         if isinstance(event, EpisodeEnd) and time.monotonic() - counted > FOLLOW_SECONDS:
             left()
 
-    if plan.runtime.workers == 1 and not plan.is_elsewhere:
+    if plan.runtime.workers == 1 and not is_elsewhere(plan.runtime):
         work(queue, prepare, see, lambda: not left())
     told = time.monotonic()
     while waiting := left():
@@ -305,11 +305,7 @@ class _Attempt:
                 self._fail(self.claim.deadly, SettingFailed(f"{MOST_DEATHS} workers died in this episode"))
             if self.left:
                 self.on_event(BlockStarted(block))
-                for one, result, started in self._in_turn():
-                    if isinstance(result, Exception):
-                        self._fail(one, failure_of(result))
-                    elif one in self.left:
-                        self._end(one, result, started)
+                self._in_turn()
         except ClaimLost:  # another worker has it, because this one was silent for too long: it did not die
             if self.running is not None:
                 patiently(self.queue.survive, self.running)
@@ -319,7 +315,7 @@ class _Attempt:
             patiently(self.queue.begin, one, self.running)
             self.running = one
 
-    def _in_turn(self) -> Iterator[tuple[Episode, EpisodeRecord | Exception, datetime]]:
+    def _in_turn(self) -> None:
         runners, settings = dict[str, RunEpisode](), self.claim.block.settings
         for number, setting in enumerate(settings, 1):
             first = next((one for one in self.left if one.setting.work == setting.work), None)
@@ -329,17 +325,17 @@ class _Attempt:
                 try:
                     runners[setting.work] = self.prepare(setting, first.task)
                 except Exception as error:  # noqa: BLE001 - the other settings go on
-                    yield first, error, datetime.now(UTC)
+                    self._fail(first, failure_of(error))
         for one in list(self.left):
             if one in self.left:
                 self._begin(one)
                 started = datetime.now(UTC)
-                result: EpisodeRecord | Exception
                 try:
-                    result = runners[one.setting.work](one.seed)
+                    record = runners[one.setting.work](one.seed)
                 except Exception as error:  # noqa: BLE001 - the other settings go on
-                    result = error
-                yield one, result, started
+                    self._fail(one, failure_of(error))
+                else:
+                    self._end(one, record, started)
 
     def _end(self, one: Episode, record: EpisodeRecord, started: datetime) -> None:
         row = episode_row(record) | {

@@ -27,7 +27,7 @@ from kerv_cli.lab.database import EPISODES
 from kerv_cli.lab.queue import MOST_DEATHS, patiently
 from kerv_cli.lab.runs import Run, bury
 from kerv_cli.lab.store import ROLLOUT, counts_of
-from kerv_cli.lab.study import Plan, save, withdraw
+from kerv_cli.lab.study import Plan, is_elsewhere, save, withdraw
 from kerv_cli.lab.work import (
     Counted,
     EpisodeRunner,
@@ -124,7 +124,7 @@ def workers(plan: Plan, run: str, say: Callable[[str], object] = lambda line: No
     # a cluster's jobs find `kerv` where this process runs, also when its folder is not on the user's PATH
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
     environment = os.environ | {STORE: study.database.store, "PATH": path}
-    if plan.blocks and plan.is_elsewhere:
+    if plan.blocks and is_elsewhere(runtime):
         words = as_overrides(study=study.name, results=str(study.database.results.absolute()))
         if study.database.store and not sa.make_url(study.database.store).password:
             words.append(f"store={study.database.shown}")
@@ -133,7 +133,7 @@ def workers(plan: Plan, run: str, say: Callable[[str], object] = lambda line: No
             _launch(runtime.launch.replace("{command}", line).replace("{workers}", str(runtime.workers)), environment)
         else:
             say(f"start workers, as many as you like: {line}")
-    if not plan.blocks or plan.is_elsewhere or runtime.workers == 1:
+    if not plan.blocks or is_elsewhere(runtime) or runtime.workers == 1:
         yield lambda left: patiently(bury, study.database)
         return
     with _local_workers(plan, run, environment) as tend:

@@ -7,7 +7,6 @@ exist in one process. The module also finds an OpenGL backend that works on this
 from __future__ import annotations
 
 import atexit
-import contextlib
 import functools
 import os
 import subprocess
@@ -118,10 +117,8 @@ def _draws(backend: str) -> bool:
     # in its own process, so that a broken driver cannot crash kerv
     environment = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
     command = [sys.executable, "-c", _PROBE]
-    with contextlib.suppress(subprocess.CalledProcessError):
-        subprocess.run(command, env=environment, capture_output=True, timeout=_PROBE_SECONDS, check=True)
-        return True
-    return False
+    done = subprocess.run(command, env=environment, capture_output=True, timeout=_PROBE_SECONDS, check=False)
+    return done.returncode == 0
 
 
 def load_mujoco() -> None:

@@ -329,11 +329,6 @@ class World(ABC):
         return np.full(3, math.nan)
 
     @property
-    def object_distance(self) -> float:
-        """Distance between `grip_point` and `object_position`, in metres. NaN if there is no object."""
-        return float(np.linalg.norm(self.grip_point - self.object_position))
-
-    @property
     def gripper(self) -> float:
         """Opening of the gripper, from 0 (closed) to 1 (open). 1 if there is no gripper."""
         names, values = self.spec.observation.proprioception, self.observation.proprioception

@@ -7,12 +7,11 @@ benchmark `MT1(task, s // 50)`.
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import functools
 import pickle
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -25,6 +24,9 @@ from kerv_cli.worlds.vectors import length
 
 _TASKS_PER_BENCHMARK = 50
 
+# Meta-World's experts warn at every second step that an action is out of range. The world clips actions anyway.
+warnings.filterwarnings("ignore", message=r"Constant\(s\) may be too high")
+
 
 @functools.lru_cache(maxsize=256)
 def _placements(task: str, benchmark_seed: int) -> tuple[Any, ...]:
@@ -32,16 +34,7 @@ def _placements(task: str, benchmark_seed: int) -> tuple[Any, ...]:
     load_mujoco()
     import metaworld
 
-    with _quiet_simulator():
-        return tuple(metaworld.MT1(task, seed=benchmark_seed).train_tasks)
-
-
-@contextlib.contextmanager
-def _quiet_simulator() -> Iterator[None]:
-    # The experts warn at every second step that an action is out of range. The world clips actions anyway.
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=r"Constant\(s\) may be too high")
-        yield
+    return tuple(metaworld.MT1(task, seed=benchmark_seed).train_tasks)
 
 
 class MetaWorld(MujocoWorld):
@@ -103,8 +96,7 @@ class MetaWorldExpert:
 
     def __call__(self, observation: Observation) -> NDArray[np.float64]:
         # clipped, because the numbers of Meta-World's experts reach 25
-        with _quiet_simulator():
-            action = self._policy.get_action(observation.state)
+        action = self._policy.get_action(observation.state)
         return np.clip(np.asarray(action, dtype=np.float64), *self._limits)
 
 
