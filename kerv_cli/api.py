@@ -209,8 +209,7 @@ class Policy:
         extra = {} if executed is None else {EXECUTED: executed}
         self.last = self._client.act({**observation, **extra, RESET: self._begins})
         self._begins = False
-        actions: np.ndarray = self.last["actions"]
-        return actions
+        return self.last["actions"]
 
 
 def load_policy(

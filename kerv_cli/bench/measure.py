@@ -6,7 +6,6 @@ The engine runs complete decodes with dummy drafts. `measure` is the whole bench
 from __future__ import annotations
 
 import functools
-import itertools
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -133,26 +132,6 @@ class Phase:
     def as_dict(self) -> dict[str, float | str]:
         rates = {"gb_per_s": self.read / self.seconds / 1e9, "gflop_per_s": self.flops / self.seconds / 1e9}
         return {"name": self.name, **asdict(self), **rates, "share": self.floor / self.seconds}
-
-
-class Laps(Stopwatch):
-    """A stopwatch that also keeps each lap as (phase, seconds), not only the sums per phase."""
-
-    def __init__(self, device: torch.device) -> None:
-        self.laps: list[Lap] = []
-        super().__init__(device)
-
-    def lap(self, phase: str) -> None:
-        before = self.phases[phase]
-        super().lap(phase)
-        self.laps.append((phase, self.phases[phase] - before))
-
-    def stop(self) -> float:
-        seconds = super().stop()
-        if self.events is not None:
-            pairs = itertools.pairwise(self.events)
-            self.laps = [(phase, begin.elapsed_time(end) / 1000.0) for (_, begin), (phase, end) in pairs]
-        return seconds
 
 
 class Dummy(Proposer):
@@ -292,7 +271,7 @@ def measure(model: Model, settings: BenchSettings) -> list[Phase]:
         costs: list[tuple[Key, float]] = []
         for decoder in every:
             evicting.sum()
-            clock = Laps(device)
+            clock = Stopwatch(device)
             prompt = model.target.encode(model.observation)
             clock.lap("vision")
             chunk = decoder.decode_prompt(prompt, clock)

@@ -272,15 +272,10 @@ def vla_shape(name: str, language: Language, prompt: int, encoder: Needs) -> Sha
     return Shape(name, sizes, language.num_hidden_layers, prompt, parts)
 
 
-def openvla(name: str, language: Language, towers: Sequence[Tower]) -> Shape:
-    encoder = encoder_of(towers, language.hidden_size)
-    return vla_shape(name, language, towers[0].patches + INSTRUCTION, encoder)
-
-
 INSTRUCTION = 25  # assumed number of prompt tokens of an instruction
 GEMMA = Language(257_152, 2048, 16_384, 18, 8, 1)  # PaliGemma's language model, Gemma 2B
 # Shapes by name. The prompt of OpenVLA-7B is 256 patches and an instruction of 25 tokens.
 SHAPES = {
-    "openvla-7b": openvla("openvla-7b", Language(), tuple(TOWERS.values())),
+    "openvla-7b": vla_shape("openvla-7b", Language(), 256 + INSTRUCTION, encoder_of(list(TOWERS.values()), 4096)),
     "pi0-fast": vla_shape("pi0-fast", GEMMA, 3 * 256 + INSTRUCTION, encoder_of_weights(414e6, 3 * 256)),
 }

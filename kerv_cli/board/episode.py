@@ -97,7 +97,7 @@ def _phases(row: Mapping[str, Any]) -> dict[str, float]:
 def _film_values(
     request: Request, found: FoundEpisode, step: int = 0, decodes: Sequence[DecodeRecord] | None = None
 ) -> dict[str, Any]:
-    job = RECORDER.job(found.recording)
+    job = RECORDER.jobs.get(found.recording)
     values: dict[str, Any] = {"found": found, "step": step, "job": job, "film": None, "same": None, "rerun": ""}
     values["slower"] = SLOWER
     if found.recording.exists() and (job is None or job.future.done()):

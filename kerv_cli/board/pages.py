@@ -42,8 +42,7 @@ TEMPLATES.filters |= {"few": few, "page_of": page_of, "figure": number, "code": 
 
 
 def database_of(request: Request) -> Database:
-    database: Database = request.app.state.database
-    return database
+    return request.app.state.database
 
 
 def refreshed(page: Callable[[Request, str, bool], Response]) -> Callable[[Request], Response]:

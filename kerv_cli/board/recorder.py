@@ -40,17 +40,14 @@ class Recorder:
     """Records episodes. A request for an episode that is already being recorded is ignored."""
 
     def __init__(self) -> None:
-        self._jobs: dict[Path, Job] = {}
+        self.jobs: dict[Path, Job] = {}
         self._pool = ThreadPoolExecutor(1)
         self._process: subprocess.Popen[str] | None = None
 
-    def job(self, path: Path) -> Job | None:
-        return self._jobs.get(path)
-
     def record(self, found: FoundEpisode) -> None:
-        job = self._jobs.get(found.recording)
+        job = self.jobs.get(found.recording)
         if job is None or job.future.done():
-            self._jobs[found.recording] = Job(self._pool.submit(self._run, found), time.time())
+            self.jobs[found.recording] = Job(self._pool.submit(self._run, found), time.time())
 
     def _run(self, found: FoundEpisode) -> str:
         database = found.store.database

@@ -26,7 +26,7 @@ from typer.core import TyperCommand
 from kerv_cli.base.config import compose, plain_text
 from kerv_cli.base.errors import UnknownName
 from kerv_cli.base.paths import check_writable
-from kerv_cli.base.registry import MODULES, NoSettings, Part, parts
+from kerv_cli.base.registry import MODULES, Part, parts
 from kerv_cli.base.settings import CommandSettings, RunSettings, choices_of
 from kerv_cli.cli.common import settings_yaml
 
@@ -40,7 +40,7 @@ class Command(Part):
     """A command `kerv NAME`. Its function's docstring becomes the help, with the section `Examples:` at its end.
 
     Args:
-        settings: Dataclass of its settings. NoSettings if it has none.
+        settings: Dataclass of its settings.
         keys: Names of the settings that `--help` lists, separated by spaces.
         typed: Maps a key as typed on the command line to the name of the setting, if the two differ.
         writes: Whether the command writes to the results folder. If so, kerv first checks that the folder is writable.
@@ -69,8 +69,7 @@ class Command(Part):
 
     @property
     def shown(self) -> list[str]:
-        keys = "" if self.settings is NoSettings else self.keys
-        return re.sub(r"\bresults\b", "results store", keys).split()
+        return re.sub(r"\bresults\b", "results store", self.keys).split()
 
 
 command = Command  # the decorator that declares a command

@@ -68,13 +68,10 @@ def doctor(settings: DoctorSettings, as_json: AsJson = False) -> None:
         findings += check_environment(specs()[settings.environment], settings.seed)
     if not settings.policy.target and not settings.environment:
         findings = check_machine(settings)
-    rows, failed = [], False
-    for one in findings:
-        rows.append((one.what, "ok" if one.ok else "FAILS", one.says))
-        failed |= not one.ok
+    failed = not all(one.ok for one in findings)
     if as_json:
         end_with_json(list(map(asdict, findings)), code=int(failed))
-    print_table(("check", "", "finding"), rows)
+    print_table(("check", "", "finding"), ((one.what, "ok" if one.ok else "FAILS", one.says) for one in findings))
     raise typer.Exit(int(failed))
 
 

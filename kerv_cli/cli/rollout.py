@@ -51,9 +51,6 @@ def rollout(
     planned = plan_rollout(resolved, check(resolved), opened(resolved.first.results), words, ROLLOUT)
     check_installed(planned, resolved)
     study = planned.study
-    if planned.existing:
-        total = len(study.episodes)
-        typer.echo(f"resuming {study.name}: {len(planned.existing)} of {total} episodes are there", err=True)
     if plan:
         names = ", ".join(f"{label}{stress_text(asdict(settings))}" for label, settings in resolved.settings.items())
         total, tasks, left = len(study.episodes), resolved.tasks, TimeLeft(planned, SECONDS_PER_EPISODE)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import shlex
-from collections.abc import Iterator
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -28,7 +26,6 @@ from kerv_cli.cli.studies import (
 from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 
 if TYPE_CHECKING:
-    from kerv_cli.episodes.resolve import ResolvedStudy
     from kerv_cli.lab.store import Study
     from kerv_cli.lab.work import Outcome
     from kerv_cli.report.tables import StudyData
@@ -69,8 +66,13 @@ def sweep(overrides: list[str], cfg: Cfg = False, show_plan: ShowPlan = False, a
     from kerv_cli.lab.workers import TimeLeft, begun, workers
     from kerv_cli.report.viewing import save_recording
 
-    with _first_commands(resolved, overrides):
+    try:
         settings = check(resolved)
+    except KervError as error:
+        if resolved.study.first:
+            typed = shlex.join(["sweep", *(word for word in overrides if word.startswith("study="))])
+            error.args = (f"{error}; 'kerv {typed} --cfg' lists under first: what to run before",)
+        raise
     planned = plan(resolved, settings, opened(resolved.first.results), ["sweep", *overrides])
     check_installed(planned, resolved)
     study, guess = planned.study, resolved.study.seconds
@@ -86,17 +88,6 @@ def sweep(overrides: list[str], cfg: Cfg = False, show_plan: ShowPlan = False, a
     print_outcome(study, outcome, data, as_json)
     write(study, outcome, data, resolved.sweep.loss)
     raise typer.Exit(int(bool(outcome.failed)))
-
-
-@contextlib.contextmanager
-def _first_commands(resolved: ResolvedStudy, overrides: list[str]) -> Iterator[None]:
-    try:
-        yield
-    except KervError as error:
-        if resolved.study.first:
-            typed = shlex.join(["sweep", *(word for word in overrides if word.startswith("study="))])
-            error.args = (f"{error}; 'kerv {typed} --cfg' lists under first: what to run before",)
-        raise
 
 
 def _list_studies(as_json: bool) -> None:

@@ -10,7 +10,7 @@ import itertools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -31,36 +31,37 @@ class Stopwatch:
     """Measures the seconds that each phase of one decode takes (`PHASES`).
 
     On CUDA it records events in the stream. The CPU waits for the GPU only at the start and at the end.
+
+    Attributes:
+        laps: After `stop`: phase and seconds of every lap, in order.
     """
 
     def __init__(self, device: torch.device) -> None:
-        self.phases = dict.fromkeys(PHASES, 0.0)
-        self.events: list[tuple[str, torch.cuda.Event]] | None = None
-        if device.type == "cuda":
+        self.on_cuda = device.type == "cuda"
+        self.phases, self.laps = dict.fromkeys(PHASES, 0.0), list[tuple[str, float]]()
+        if self.on_cuda:
             torch.cuda.synchronize()
-            self.events = [("", self._event())]
-        self.began = self.last = time.perf_counter()
+        self.began = time.perf_counter()
+        self._marks = [("", self._mark())]
 
     def lap(self, phase: str) -> None:
-        if self.events is not None:
-            self.events.append((phase, self._event()))
-            return
-        now = time.perf_counter()
-        self.phases[phase] += now - self.last
-        self.last = now
+        self._marks.append((phase, self._mark()))
 
     def stop(self) -> float:
         self.lap("other")
-        if self.events is not None:
+        if self.on_cuda:
             torch.cuda.synchronize()
-            self.last = time.perf_counter()
-            for (_, begin), (phase, end) in itertools.pairwise(self.events):
-                self.phases[phase] += begin.elapsed_time(end) / 1000.0
-            self.phases["other"] += max(0.0, self.last - self.began - sum(self.phases.values()))
-        return self.last - self.began
+        total = time.perf_counter() - self.began
+        for (_, begin), (phase, end) in itertools.pairwise(self._marks):
+            self.laps.append((phase, begin.elapsed_time(end) / 1000.0 if self.on_cuda else end - begin))
+        self.laps.append(("other", max(0.0, total - sum(seconds for _, seconds in self.laps))))
+        for phase, seconds in self.laps:
+            self.phases[phase] += seconds
+        return total
 
-    @staticmethod
-    def _event() -> torch.cuda.Event:
+    def _mark(self) -> Any:
+        if not self.on_cuda:
+            return time.perf_counter()
         event = torch.cuda.Event(enable_timing=True)
         event.record()
         return event

@@ -116,8 +116,7 @@ class Draft:
         seen, size = self.ancestors, before + len(self)
         if seen is None:
             return None
-        places = np.arange(size)
-        mask: Any = places[:, None] >= places
+        mask: Any = np.tri(size, dtype=bool)
         if isinstance(seen, Tensor):
             mask = torch.ones(size, size, dtype=torch.bool, device=seen.device).tril_()
         mask[before:, before:] = seen

@@ -123,10 +123,6 @@ class DecodeRecord:
     def delay_steps(self) -> int | None:
         return None if self.delay is None else self.delay.steps
 
-    @property
-    def unverified(self) -> int:
-        return self.unverified_among(0, len(self.actions))
-
     def unverified_among(self, first: int, end: int) -> int:
         """Return the number of unverified values among the control steps first … end − 1 of `actions`.
 
@@ -212,10 +208,6 @@ class EpisodeRecord:
     @property
     def seconds(self) -> float:
         return sum(d.seconds for d in self.decodes)
-
-    @property
-    def timed(self) -> bool:
-        return not math.isnan(self.seconds)
 
     @property
     def executed(self) -> list[tuple[int, int]]:

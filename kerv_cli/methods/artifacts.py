@@ -217,8 +217,7 @@ class Artifacts:
 
 
 def kind_of(name: str) -> Artifact[Any]:
-    kind: Artifact[Any] = ArtifactPart.find(name).built()
-    return kind
+    return ArtifactPart.find(name).built()
 
 
 @functools.lru_cache(maxsize=16)

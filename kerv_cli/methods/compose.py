@@ -96,7 +96,7 @@ class Method:
         from kerv_cli.engine.decoder import Decoder, Parts
 
         self.check(target)
-        context = Context(target, artifact, task, method=self.settings, chunk=self.chunk)
+        context = Context(target, artifact, task, chunk=self.chunk)
         for kind, part in self.parts.items():
             context.built[kind] = part.built(self.settings[kind], context)
         return Decoder(target, Parts(**context.built), self.chunk)

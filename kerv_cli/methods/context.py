@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,7 +16,6 @@ class Context:
         artifact: Function that returns the loaded artifact of a kind, such as `drafter`.
         task: Full name of the task. Empty if unknown.
         built: The method's parts that are built already, by kind such as `proposer`.
-        method: Settings of all parts of the method, by kind.
         chunk: Number of control steps per chunk. If 0, as many as the target was trained for.
     """
 
@@ -24,7 +23,6 @@ class Context:
     artifact: Callable[[str], Any]
     task: str = ""
     built: dict[str, Any] = field(default_factory=dict)
-    method: Mapping[str, Any] = field(default_factory=dict)
     chunk: int = 0
 
     @property

@@ -16,11 +16,8 @@ if TYPE_CHECKING:
     from kerv_cli.engine.draft import Draft
 
 DECAY = 0.8  # factor by which the weight of an error falls with every later action
-CAP, FLOOR, FIRST = (
-    4.0,
-    0.1,
-    0.5,
-)  # bins: largest error that counts, smallest scale; weight of the scale 1 to begin with
+CAP, FLOOR = 4.0, 0.1  # bins: largest error that counts, smallest scale
+FIRST = 0.5  # weight of the scale 1 to begin with
 SHARE = 0.1  # share of the trust that is split equally between both guesses, however wrong they were
 WIDTH = 16  # tokens that are considered at each place
 
@@ -108,8 +105,7 @@ def probabilities(guesses: np.ndarray, scales: np.ndarray, vocabulary: int) -> n
 
     ratio = scales / (1 + scales)
     away = np.abs(np.arange(vocabulary) - np.clip(guesses, 0, vocabulary - 1)[..., None])
-    found: np.ndarray = ((1 - ratio) / (1 + ratio))[..., None] * ratio[..., None] ** away + 1e-9
-    return found
+    return ((1 - ratio) / (1 + ratio))[..., None] * ratio[..., None] ** away + 1e-9
 
 
 def likely_tree(table: np.ndarray, weights: np.ndarray, nodes: int) -> tuple[list[int], list[int]]:

@@ -88,10 +88,6 @@ class Measures:
     def pairs(self) -> int:
         return int(sum(self.counts))
 
-    @property
-    def is_timed(self) -> bool:
-        return is_number(self.time_per_step_ms)
-
 
 @dataclass(frozen=True)
 class Result:
@@ -298,7 +294,7 @@ def speedups_of_runs(runs: Sequence[pd.DataFrame], by: Sequence[str], same_pairs
 def speedups(pairs: pd.DataFrame, by: Sequence[str] = OVERALL, all_pairs: bool = False) -> dict[Hashable, Speeds]:
     """Return the speedups of each group of pairs.
 
-    A group is left out if no pair is usable, if an episode was not timed, or if its setting runs no decoder.
+    A group is left out if no pair is usable, or if its setting runs no decoder.
 
     Args:
         by: OVERALL or PER_TASK.
@@ -317,11 +313,10 @@ def speedups(pairs: pd.DataFrame, by: Sequence[str] = OVERALL, all_pairs: bool =
         baseline, method = times[f"{column}_baseline"][index], times[f"{column}_method"][index]
         return stats.speedup(baseline, method, tasks[index], clusters[index])
 
-    untimed = np.isnan(times["seconds_baseline"]) | np.isnan(times["seconds_method"])
     found = {}
     for group, members in timed.groupby(list(by)).indices.items():
         index = np.asarray(members)
-        if decodes[index].any() and not untimed[index].any():
+        if decodes[index].any():
             solved_by_both = index[solved[index]]
             found[group] = Speeds(ratio("time", index), ratio("seconds", index), ratio("seconds", solved_by_both))
     return found

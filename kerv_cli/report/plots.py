@@ -12,7 +12,6 @@ import itertools
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
-from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +20,6 @@ import numpy as np
 import pandas as pd
 import vl_convert
 
-from kerv_cli.base.durations import count
 from kerv_cli.base.errors import CheckpointError, StorageError
 from kerv_cli.base.files import own_folder, write_if_changed, write_text
 from kerv_cli.report.measures import Result, is_number
@@ -53,7 +51,7 @@ class Panel(NamedTuple):
     """One chart in a row of charts."""
 
     title: str
-    points: Sequence[Point]  # A point without x is drawn as a line across the panel
+    points: list[Point]  # A point without x is drawn as a line across the panel
     xlabel: str
     names: Sequence[str] = ()  # names of the places on the x axis, in order. Empty if x is a number.
 
@@ -82,15 +80,6 @@ def study_figures(results: Sequence[Result], axis: str, loss: float = 3.0) -> di
         both = [Panel(TITLES[name], _points(results, name, places), axis) for name in (SPEED, SUCCESS)]
         return {"line": lines_figure([one for one in both if one.points], colours)}
     return {"tradeoff": _tradeoff(results, loss, colours)} if any(row.is_compared for row in results) else {}
-
-
-def about(results: Sequence[Result]) -> str:
-    first = results[0]
-    targets = list(dict.fromkeys(str(row.settings["policy.target"]) for row in results))
-    names = ", ".join(targets) if len(targets) <= 2 else f"{len(targets)} policies"
-    tasks, episodes = (max(map(attrgetter(name), results)) for name in ("tasks", "episodes"))
-    counts = f"{count(len(results), 'setting')} on {count(tasks, 'task')}, {count(episodes, 'episode')} each"
-    return f"{names} · {counts} · {first.provenance['device_name']}, {first.settings['runtime.dtype']}"
 
 
 def colours_of(results: Sequence[Result]) -> dict[str, str]:
@@ -219,7 +208,11 @@ def acceptance_figure(data: StudyData) -> alt.ConcatChart:
     """
     number = max(len(tally.reached) for tally in data.tallies.values())
     dofs = dof_names(data.task_results[0].task, number)
-    places: tuple[list[Point], list[Point], list[Point]] = [], [], []
+    panels = [
+        Panel("Accepted tokens, %, by position in the draft", [], "position in the draft"),
+        Panel("Accepted tokens, %, by DoF", [], "degree of freedom", dofs),
+        Panel("Drafts, %, by number of accepted tokens", [], "accepted tokens"),
+    ]
     for label, tally in data.tallies.items():
         reached, accepted = tally.by_position
         lines = (
@@ -227,21 +220,13 @@ def acceptance_figure(data: StudyData) -> alt.ConcatChart:
             (dofs, tally.accepted, tally.reached),
             (range(len(tally.lengths)), tally.lengths, np.full(len(tally.lengths), tally.drafts)),
         )
-        for points, (names, parts, wholes) in zip(places, lines, strict=True):
+        for panel, (names, parts, wholes) in zip(panels, lines, strict=True):
             for x, part, whole in zip(names, parts.tolist(), wholes.tolist(), strict=True):
                 if whole:
                     point: Point = {"setting": label, "line": label, "x": x}
                     point |= dict.fromkeys(("value", "low", "high"), 100.0 * part / whole)
                     shown = {"text setting": label, "text place": x, "text tokens": part, "text of": whole}
-                    points.append(point | shown)
-    titles = (
-        "Accepted tokens, %, by position in the draft",
-        "Accepted tokens, %, by DoF",
-        "Drafts, %, by number of accepted tokens",
-    )
-    labels = "position in the draft", "degree of freedom", "accepted tokens"
-    names_of: tuple[Sequence[str], ...] = (), dofs, ()
-    panels = itertools.starmap(Panel, zip(titles, places, labels, names_of, strict=True))
+                    panel.points.append(point | shown)
     return lines_figure([panel for panel in panels if panel.points], colours_of(data.results))
 
 

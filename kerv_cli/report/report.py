@@ -25,13 +25,14 @@ from kerv_cli.episodes.identity import NOT_DETERMINING, without
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.store import ROLLOUT, SWEEP, Study, counts_of, studies, sweep_command
 from kerv_cli.report.measures import Measures, Result, Row, columns_of, csv_text
-from kerv_cli.report.plots import about, acceptance_figure, library, study_figures
+from kerv_cli.report.plots import acceptance_figure, library, study_figures
 from kerv_cli.report.profiles import NamedProfile, open_profiles
 from kerv_cli.report.reprice import Priced, own_profiles, prices_table, repriced
 from kerv_cli.report.summary import (
     ASSUMES,
     MAIN,
     MEANINGS,
+    about,
     columns_shown,
     note_of,
     repriced_summary,
@@ -57,15 +58,6 @@ CSV_COLUMNS = (
 LOSS = 3.0
 # Films play at half speed. With more than half this many frames, a film plays faster, to stay short and small.
 _FRAMES = 240
-
-
-def to_report(database: Database, study: str | None) -> list[Study]:
-    if study:
-        return [Study(database, study)]
-    stores = [one for one in studies(database) if one.kind != ROLLOUT and counts_of(one)[0]]
-    if not stores:
-        raise UsageError(f"no study in {database.results} has an episode: run `kerv sweep study=demo`")
-    return sorted(stores, key=lambda one: one.name)
 
 
 @dataclass(frozen=True)
@@ -125,7 +117,11 @@ def report(
         given = f"on={','.join(on)}" if on else f"baseline={baseline}"
         raise UsageError(f"{given}: name the study with study=NAME")
     profiles, reports = open_profiles(database.results, on), []
-    for store in to_report(database, study):
+    swept = (one for one in studies(database) if one.kind != ROLLOUT and counts_of(one)[0])
+    stores = [Study(database, study)] if study else sorted(swept, key=lambda one: one.name)
+    if not stores:
+        raise UsageError(f"no study in {database.results} has an episode: run `kerv sweep study=demo`")
+    for store in stores:
         say(f"{store.name}: reading {count(counts_of(store)[0], 'episode')}")
         data = load_study(store)
         if baseline:

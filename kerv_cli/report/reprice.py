@@ -40,22 +40,18 @@ class Priced:
 
 
 def prices_table(priced: Sequence[Priced]) -> list[Row]:
-    rows = []
+    rows, encoders = [], dict.fromkeys(itertools.chain.from_iterable(one.encoders for one in priced))
     for one in priced:
         result, of, measured = one.result, one.measures, one.result.measures
         row: Row = {"study": result.study, "label": result.label, "baseline": result.baseline, "on": one.machine.name}
         row |= {"machine": one.machine.title, "projected": one.machine.is_projected}
         row |= {"episode_speedup": of.episode_speedup, "speedup": of.speedup}
         row |= {"time_per_episode_ms": of.time_per_episode_ms, "time_per_step_ms": of.time_per_step_ms}
-        row |= {"latency_p95_ms": of.latency_p95_ms, **{name: one.encoders.get(name) for name in encoders_of(priced)}}
+        row |= {"latency_p95_ms": of.latency_p95_ms, **{name: one.encoders.get(name) for name in encoders}}
         row |= {"measured_episode_speedup": measured.episode_speedup, "measured_speedup": measured.speedup}
         row |= {"measured_on": result.provenance["device_name"], "episodes": result.episodes, "pairs": of.pairs}
         rows.append(columns_of(row))
     return rows
-
-
-def encoders_of(priced: Sequence[Priced]) -> list[str]:
-    return list(dict.fromkeys(itertools.chain.from_iterable(one.encoders for one in priced)))
 
 
 def repriced(data: StudyData, profiles: Sequence[NamedProfile], lenient: bool = False) -> list[Priced]:

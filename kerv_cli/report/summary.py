@@ -28,7 +28,7 @@ from kerv_cli.report.tables import StudyData
 
 MISSING = "–"
 APART = "*"
-SPEEDS = {"episode_speedup": "speed, per episode", "speedup": "speed, per step"}
+PER_EPISODE, PER_STEP = "speed, per episode", "speed, per step"
 DIFFERENCE = "change in success"
 LATENCY = "slowest 5 % of decodes, ms"
 # One row of a printed table: heading to text. All rows of a table have the same headings.
@@ -48,10 +48,9 @@ ANSWER, OF_SERVER = "an answer takes, ms", "of it the server's, ms"
 MEANINGS = {
     "success": "share of episodes that solved their task",
     DIFFERENCE: "points more or less than {0}, over pairs: episodes of both from the same initial state",
-    SPEEDS[
-        "episode_speedup"
-    ]: "inference time of {0} until success or the horizon ÷ that of the setting, over pairs on the same device",
-    SPEEDS["speedup"]: "the same for the time of a control step. * means: some pairs were not measured in turn; the "
+    PER_EPISODE: "inference time of {0} until success or the horizon ÷ that of the setting, over pairs on the same "
+    "device",
+    PER_STEP: "the same for the time of a control step. * means: some pairs were not measured in turn; the "
     "speed is of the others",
     LATENCY: "95 % of the decodes take less time than this",
     ANSWER: "mean time from an observation to the server's actions, as the client sees it",
@@ -97,7 +96,7 @@ def interval(estimate: Estimate, form: str = ".2f", unit: str = "", scale: float
 def _speed(row: Result, speed: Estimate) -> str:
     measures = row.measures
     if row.is_baseline:
-        return "1×" if measures.is_timed else MISSING
+        return "1×"
     apart = is_number(measures.speedup.value) and measures.same_block < 1 and not measures.same_run
     return interval(speed, unit="×") + (APART if apart else "")
 
@@ -108,11 +107,11 @@ def cells_of(row: Result) -> Cells:
     return {
         "setting": row.label,
         "success": interval(of.success, ".0f", " %", 100.0),
-        SPEEDS["episode_speedup"]: _speed(row, of.episode_speedup),
+        PER_EPISODE: _speed(row, of.episode_speedup),
         DIFFERENCE: "" if row.is_baseline else interval(of.difference, "+.0f", "", 100.0, " to "),
         "tokens unverified": share(of.unverified_share),
         LATENCY: number(of.latency_p95_ms),
-        SPEEDS["speedup"]: _speed(row, of.speedup),
+        PER_STEP: _speed(row, of.speedup),
         "a decode takes, ms": number(of.felt_latency_ms),
         ANSWER: number(of.answer_ms) if is_number(of.server_ms) else MISSING,
         OF_SERVER: number(of.server_ms),
@@ -143,6 +142,15 @@ def columns_shown(rows: Sequence[Cells]) -> set[str]:
     return {name for name in rows[0] if {row[name] for row in rows} - {MISSING, ""}}
 
 
+def about(results: Sequence[Result]) -> str:
+    first = results[0]
+    targets = list(dict.fromkeys(str(row.settings["policy.target"]) for row in results))
+    names = ", ".join(targets) if len(targets) <= 2 else f"{len(targets)} policies"
+    tasks, episodes = (max(map(attrgetter(name), results)) for name in ("tasks", "episodes"))
+    counts = f"{count(len(results), 'setting')} on {count(tasks, 'task')}, {count(episodes, 'episode')} each"
+    return f"{names} · {counts} · {first.provenance['device_name']}, {first.settings['runtime.dtype']}"
+
+
 @dataclass(frozen=True)
 class SummaryTable:
     """A study's table as `rich` prints it."""
@@ -154,10 +162,7 @@ class SummaryTable:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
         results = self.results
         first = results[0]
-        tasks, episodes = (max(map(attrgetter(name), results)) for name in ("tasks", "episodes"))
-        counts = f"{count(tasks, 'task')}, {count(episodes, 'episode')} per setting"
-        device = f"{first.provenance['device_name']}, {first.settings['runtime.dtype']}"
-        yield Text(f"{first.study}: {counts}, {device}", "bold", overflow="fold")
+        yield Text(f"{first.study}: {about(results)}", "bold", overflow="fold")
         rows = summary(results)
         own = [name for name in rows[0] if name.replace(" ", "_") in first.measures.added]  # of plugins
         names = list(rows[0]) if self.all else list(dict.fromkeys([*list(rows[0])[:MAIN], *own]))
@@ -167,11 +172,8 @@ class SummaryTable:
             yield Text(f"{len(names)} of {len(rows[0])} columns; {self.how} shows all")
         several = ", under the same stress and clock" if len({row.baseline for row in results}) > 1 else ""
         yield Text(f"{note_of(results, names)}Baseline: {first.baseline}{several}.")
-        if any(row[SPEEDS["episode_speedup"]].endswith(APART) for row in rows):
+        if any(row[PER_EPISODE].endswith(APART) for row in rows):
             yield Text(f"{APART} only from pairs that were measured in turn")
-        untimed = [row.label for row in results if not row.measures.is_timed]
-        if untimed:
-            yield Text(f"not timed, for success alone: {', '.join(untimed)}")
 
 
 def note_of(results: Sequence[Result], names: Sequence[str] = ()) -> str:
@@ -220,14 +222,12 @@ def _parts(rows: Sequence[Cells], names: Sequence[str], width: int) -> Iterator[
 
 
 def not_in_turn(results: Sequence[Result]) -> list[str]:
-    """Return the labels of timed settings that share no block with the baseline, so that no speedup is known."""
+    """Return the labels of settings that share no block with the baseline, so that no speedup is known."""
     apart: dict[str, None] = {}
     for row in results:
         of = row.measures
-        if row.is_baseline and not of.is_timed:
-            return []
         decodes = of.forwards_per_step + of.skip_rate > 0 or is_number(of.server_ms)
-        if row.is_compared and decodes and of.is_timed and not is_number(of.speedup.value):
+        if row.is_compared and decodes and not is_number(of.speedup.value):
             apart[row.label] = None
     return list(apart)
 
@@ -246,18 +246,16 @@ def setting_tables(data: StudyData) -> Iterator[tuple[Any, Any, str]]:
     seeds = f"seeds {seeds}" if episodes["seed"].nunique() > 1 else f"seed {seeds}"
     observation = setting.identity.get("observation", "")
     title = f"{setting.label}, observation {observation}{stress_text(setting.settings)}, {seeds}"
-    timed = episodes["seconds"].notna().all()
     yield _TASK_COLUMNS, rows, title
-    if timed:
-        decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()
-        shares = []
-        times = {phase: episodes[f"seconds.{phase}"].sum() for phase in PHASES}
-        if of_server := episodes["server_seconds"].sum():
-            times = {"server": of_server, "network and client": total - of_server}
-        for phase, seconds in times.items():
-            if seconds:
-                shares.append((phase, f"{1000 * seconds / decodes:.2f}", f"{seconds / total:.0%}"))
-        yield ("phase", "ms per decode", "share"), shares, "time by phase"
+    decodes, total = episodes["decodes"].sum(), episodes["seconds"].sum()
+    shares = []
+    times = {phase: episodes[f"seconds.{phase}"].sum() for phase in PHASES}
+    if of_server := episodes["server_seconds"].sum():
+        times = {"server": of_server, "network and client": total - of_server}
+    for phase, seconds in times.items():
+        if seconds:
+            shares.append((phase, f"{1000 * seconds / decodes:.2f}", f"{seconds / total:.0%}"))
+    yield ("phase", "ms per decode", "share"), shares, "time by phase"
 
 
 def task_table(results: Sequence[Result]) -> list[Cells]:

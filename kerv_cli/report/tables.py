@@ -296,12 +296,7 @@ def passing(rows: Iterable[Result], loss: float) -> list[Result]:
     Args:
         loss: Largest acceptable loss of success, as a share of episodes.
     """
-    passed = []
-    for row in rows:
-        if not row.measures.difference.low > -loss:
-            break
-        passed.append(row)
-    return passed
+    return list(itertools.takewhile(lambda row: row.measures.difference.low > -loss, rows))
 
 
 def _series_of(setting: Setting, axis: str) -> str:
@@ -314,11 +309,7 @@ def _series_of(setting: Setting, axis: str) -> str:
 
 def flatten(settings: Plain) -> Row:
     """Return nested settings with dotted keys, such as `threshold.r`. Lists become text, joined by `;`."""
-    values = flat(settings)
-    for key, value in values.items():
-        if isinstance(value, list | tuple):
-            values[key] = _joined(value)
-    return values
+    return {key: _joined(one) if isinstance(one, list | tuple) else one for key, one in flat(settings).items()}
 
 
 def _joined(values: Iterable[object]) -> str:

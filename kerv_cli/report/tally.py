@@ -125,10 +125,7 @@ class Tally:
 
 def rates(reached: np.ndarray, accepted: np.ndarray) -> list[float | None]:
     """Return `accepted` ÷ `reached`, entry by entry. An entry is None if `reached` is 0."""
-    quotients: list[float | None] = (accepted / np.maximum(reached, 1)).tolist()
-    for position in np.flatnonzero(reached == 0):
-        quotients[position] = None
-    return quotients
+    return [part / whole if whole else None for whole, part in zip(reached.tolist(), accepted.tolist(), strict=True)]
 
 
 def _sum(first: np.ndarray, second: np.ndarray) -> np.ndarray:

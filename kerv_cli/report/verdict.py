@@ -104,9 +104,8 @@ class Verdict(NamedTuple):
     episodes: int = 0
 
 
-def verdict_of(results: Sequence[Result], loss: float) -> Verdict:
+def verdict_of(rows: Sequence[Result], loss: float) -> Verdict:
     """Return a study's answer, given its rows over all tasks. `loss` is in points."""
-    rows = results
     baselines = {row.baseline for row in rows if row.is_compared}
     if not baselines:
         rates = ", ".join(f"{row.label} {POINTS * row.measures.success.value:.1f} %" for row in rows)

@@ -120,10 +120,9 @@ class Policy:
     @property
     def work(self) -> str:
         """Hash of the settings and weights that determine the actions."""
-        settings: Any = self.facts()["settings"]
-        return work_of(settings, self.identity)
+        return work_of(self.facts()["settings"], self.identity)
 
-    def facts(self) -> dict[str, object]:
+    def facts(self) -> dict[str, Any]:
         """Return settings, hashes of the policy's files, and the machine, for the server's greeting."""
         shared = {setting.name: getattr(self.settings, setting.name) for setting in fields(MethodSettings)}
         settings = asdict(RolloutSettings(**shared))

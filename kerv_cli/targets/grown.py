@@ -113,7 +113,6 @@ def build(folder: Path, description: TargetDescription, device: str, dtype: torc
     base = Path(recipe.base)
     target = build_compact(base, checkpoint.read_target(base), device, dtype)
     _grow(target, recipe)
-    target.sha256 = description.sha256
     if recipe.drafter:
         target.enlarges = functools.partial(_enlarge, recipe=recipe, padding=target.trunk.padding)
     compile_parts(target)

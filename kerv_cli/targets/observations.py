@@ -77,23 +77,17 @@ class Observations(Rows):
 
 
 def read_observations(
-    episode: DemoEpisode,
-    settings: TargetSettings,
-    space: ObservationSpace,
-    words: WordTokenizer,
-    chosen: slice | np.ndarray = slice(None),
+    episode: DemoEpisode, settings: TargetSettings, space: ObservationSpace, words: WordTokenizer
 ) -> Observations:
     """Return the observations of an episode, to train a compact policy.
 
-    Args:
-        chosen: Which of the control steps to return, or, if the policy reads images, which of those with an image.
+    If the policy reads images, only the control steps with an image are observations.
     """
-    sees, frames = settings.observation == "vision", None
-    steps = observed_steps(episode, sees)[chosen]
+    sees = settings.observation == "vision"
+    steps = observed_steps(episode, sees)
+    frames: Any = episode.frames if sees else None
     if sees:
         check_frames(episode, settings.image_size)
-        assert isinstance(episode.frames, EncodedFrames)
-        frames = episode.frames[chosen]
     states = torch.from_numpy(episode.states[steps]).float()
     ids = torch.tensor([words.encode(instruction_of(episode.task), settings.instruction_tokens)])
     proprioception = states[:, : len(space.proprioception)]

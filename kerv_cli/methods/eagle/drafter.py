@@ -267,10 +267,8 @@ class EagleDrafter(TrainableDrafter):
             guessed, states = predicted[:, length - 1 :], hidden[:, length:]  # of the chunk's tokens 1 to N − 1
             if counted is not None:
                 guessed, states = guessed[counted], states[counted]
-            teacher, logits = (
-                target.head(states.to(target.dtype)).float(),
-                target.head(guessed.to(target.dtype)).float(),
-            )
+            teacher = target.head(states.to(target.dtype)).float()
+            logits = target.head(guessed.to(target.dtype)).float()
             token_loss = -(teacher.softmax(-1) * F.log_softmax(logits, -1)).sum(-1).mean()
             state_loss = F.smooth_l1_loss(guessed, states)
             total = total + settings.state_weight * state_loss + settings.token_weight * token_loss

@@ -108,8 +108,7 @@ def _unit(vectors: Tensor) -> Tensor:
 def projected(keys: np.ndarray, projection: np.ndarray) -> np.ndarray:
     """Project keys (n, d) onto the directions `projection` (d, c). Return (n, c) float32 keys, each with the norm 1."""
     vectors = keys @ projection
-    units: np.ndarray = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
-    return units.astype(np.float32)
+    return (vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)).astype(np.float32)
 
 
 def check_seeds(seeds: Mapping[str, Sequence[int]], where: object) -> None:

@@ -38,8 +38,7 @@ class PredictorPart(ProposerPart):
         return PredictionProposer(self.predictor(context))
 
     def predictor(self, context: Context) -> Predictor:
-        built: Predictor = super().built(self.default, context)
-        return built
+        return super().built(self.default, context)
 
 
 def predictor(settings: NoSettings, context: Context) -> Predictor:

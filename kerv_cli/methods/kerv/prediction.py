@@ -131,8 +131,7 @@ class Predictor:
             return None
         past = np.asarray(history, dtype=np.float64)[-self.window :]
         table = self.tables[len(past)][:, :steps]
-        predicted: np.ndarray = np.einsum("dhm,bmd->bhd", table, past[None])[0]
-        return np.clip(predicted, -1.0, 1.0)
+        return np.clip(np.einsum("dhm,bmd->bhd", table, past[None])[0], -1.0, 1.0)
 
 
 class Hold(Predictor):

@@ -179,10 +179,6 @@ def summary(record: EpisodeRecord, method: str) -> str:
     return "\n".join(lines)
 
 
-def _text(value: object) -> str:
-    return "" if value is None else str(value)
-
-
 def decode_table(
     decode: DecodeRecord, number: int, step: int, outcomes: Sequence[TokenOutcome], names: Sequence[str]
 ) -> str:
@@ -217,5 +213,5 @@ def decode_table(
         word = f"**{word}**" if outcome.kind == "rejected" else word
         place = [index] if is_coded else [index, step, names[dof]]
         cells = (*place, outcome.draft, outcome.target, outcome.limit, outcome.token, word)
-        lines.append(f"| {' | '.join(map(_text, cells))} |")
+        lines.append(f"| {' | '.join('' if cell is None else str(cell) for cell in cells)} |")
     return "\n".join(lines)

@@ -34,10 +34,7 @@ _START_SECONDS = 2.0
 
 def recordings_below(folder: Path) -> Iterator[Path]:
     """Yield the .rrd files in a folder and its subfolders, except hidden files. Unreadable folders are left out."""
-    for place, _, names in os.walk(folder):
-        for name in names:
-            if name.endswith(".rrd") and not name.startswith(".") and (path := Path(place, name)).is_file():
-                yield path
+    return filter(Path.is_file, folder.rglob("[!.]*.rrd"))
 
 
 def find_recordings(paths: Iterable[Path]) -> list[Path]:

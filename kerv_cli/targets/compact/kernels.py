@@ -76,10 +76,8 @@ def _tile(rows: int, kind: int, lanes: int) -> Callable[..., None]:
         builder.branch(loop)
         builder.position_at_end(loop)
         index, sums, totals = builder.phi(WORD), [builder.phi(vector) for _ in range(rows)], []
-        row, following = (
-            load(weights, index, PANEL * size, ir.VectorType(stored, lanes), size),
-            builder.add(index, WORD(1)),
-        )
+        row = load(weights, index, PANEL * size, ir.VectorType(stored, lanes), size)
+        following = builder.add(index, WORD(1))
         if kind == BFLOAT:  # the upper half of a float32 number
             row = builder.bitcast(builder.shl(builder.zext(row, words), ir.Constant(words, upper)), vector)
         elif kind != FLOAT:

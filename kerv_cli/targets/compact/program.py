@@ -85,8 +85,7 @@ class Blocked:
 
     def __call__(self, x: Tensor) -> Tensor:
         x = x.to(torch.bfloat16)
-        product: Tensor = torch.ops.mkldnn._linear_pointwise(x, self.weight, self.bias, "none", [], "")
-        return product
+        return torch.ops.mkldnn._linear_pointwise(x, self.weight, self.bias, "none", [], "")
 
 
 class Matrix:
@@ -244,8 +243,7 @@ class Program:
         mask[:, : cache.length] = 0.0
         rows = [x.expand(top_k, *x.shape[1:]) for x in inputs]
         self._execute(rows, torch.full((top_k,), position), cache, mask, results)
-        found: tuple[np.ndarray, np.ndarray, np.ndarray] = kernels().best(results, top_k, nodes)
-        return found
+        return kernels().best(results, top_k, nodes)
 
     def _execute(
         self,

@@ -78,7 +78,6 @@ class CompactTarget(Compilable):
     Attributes:
         cameras: A tuple with one name, the camera whose images are read. Empty if the policy reads the state.
         max_prompt: P, number of prompt tokens. It is the same for every observation and instruction.
-        sha256: Hash of the weights that were loaded. Empty if no weights were loaded.
         parallel: Whether the policy decodes all tokens in one forward (`parallel_pass`), and not single tokens.
         enlarges: Function that enlarges a drafter in place, as this target was enlarged (docs/methods.md §0.2). None if
             drafters stay as they are.
@@ -97,7 +96,7 @@ class CompactTarget(Compilable):
     ) -> None:
         super().__init__()
         s = self.settings = settings
-        self.actions, self.observation, self.words, self.sha256 = actions, observation, words, ""
+        self.actions, self.observation, self.words = actions, observation, words
         self.enlarges: Callable[[Any], None] | None = None
         self.chunk, self.parallel = s.chunk, s.parallel
         self.width, self.heads, self.feed_forward = s.width, s.heads, s.feed_forward
@@ -170,8 +169,6 @@ class CompactTarget(Compilable):
             )
         images = None
         for camera in self.cameras:
-            if camera not in observation.images:
-                raise CheckpointError(f"the target was trained on images of camera '{camera}', which were not drawn")
             image = np.ascontiguousarray(observation.images[camera])
             if image.shape != self.frame_shape:
                 raise CheckpointError(
@@ -354,5 +351,4 @@ def build(folder: Path, description: TargetDescription, device: str, dtype: torc
     camera = description.cameras[0] if description.cameras else ""
     words = WordTokenizer(description.words)
     target = CompactTarget(settings, description.actions, description.observation, words, camera)
-    target.sha256 = description.sha256
     return load_compiled(target, folder, "target", device, dtype)

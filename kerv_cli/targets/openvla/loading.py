@@ -93,15 +93,6 @@ def open_shards(folder: Path) -> Shards:
     return Shards(folder, tensors, shapes)
 
 
-def check_layout(shapes: Mapping[str, Sizes], expected: Mapping[str, Sizes], where: Path) -> None:
-    wrong = sorted(name for name in {*shapes, *expected} if shapes.get(name) != expected.get(name))
-    if wrong:
-        raise CheckpointError(
-            f"the weights in {where} are not those of its {CONFIG}: {len(wrong)} are missing, unknown or of another "
-            f"shape, such as {wrong[0]}"
-        )
-
-
 def layout(shape: Shape) -> dict[str, Sizes]:
     with torch.device("meta"):
         state = OpenVLAModel(shape).state_dict()
@@ -120,8 +111,14 @@ def is_unread(name: str, shape: Shape) -> bool:
 
 
 def open_checked(folder: Path, shape: Shape) -> Shards:
-    shards = open_shards(folder)
-    check_layout({n: s for n, s in shards.shapes.items() if not is_unread(n, shape)}, layout(shape), folder)
+    shards, expected = open_shards(folder), layout(shape)
+    shapes = {name: sizes for name, sizes in shards.shapes.items() if not is_unread(name, shape)}
+    wrong = sorted(name for name in {*shapes, *expected} if shapes.get(name) != expected.get(name))
+    if wrong:
+        raise CheckpointError(
+            f"the weights in {folder} are not those of its {CONFIG}: {len(wrong)} are missing, unknown or of another "
+            f"shape, such as {wrong[0]}"
+        )
     return shards
 
 

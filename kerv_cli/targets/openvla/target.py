@@ -91,10 +91,7 @@ class OpenVLATarget:
         return torch.cat([prompt[:, self.segments[name]].mean(1) for name in ("vision", "instruction")], -1)
 
     def encode(self, observation: Observation) -> Tensor:
-        camera = self.cameras[0]
-        if camera not in observation.images:
-            raise CheckpointError(f"the target sees camera '{camera}', whose image was not drawn")
-        image, settings = observation.images[camera], self.settings
+        image, settings = observation.images[self.cameras[0]], self.settings
         pixels = pixels_of(image, self.shape, self.normalisations, settings.crop, settings.libero)
         patches = self.model.projector(self.model.vision_backbone(upload(pixels, self.device).to(self.dtype)))
         words = self.words(observation.instruction)
