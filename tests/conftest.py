@@ -149,9 +149,9 @@ def quick_training(monkeypatch):
     monkeypatch.setattr(plots, "png", lambda *_: b"")
 
 
-@contextlib.contextmanager
-def without_charts() -> Iterator[None]:
-    """Leave the charts of reports empty: to draw them takes most of the time of a short sweep."""
+@pytest.fixture(scope="module")
+def quick_report():
+    """The charts of reports are empty in this module: to draw them takes most of the time of a short sweep."""
     import altair
 
     from kerv_cli.report import plots
@@ -159,13 +159,6 @@ def without_charts() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name in ("lines_figure", "_tradeoff"):
             patch.setattr(plots, name, lambda *_: altair.concat())
-        yield
-
-
-@pytest.fixture(scope="module")
-def quick_report():
-    """The charts of reports are empty in this module."""
-    with without_charts():
         yield
 
 

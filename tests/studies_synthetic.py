@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,18 +24,13 @@ from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import Database, opened
 from kerv_cli.lab.plan import all_episodes
 from kerv_cli.lab.store import Study
-from kerv_cli.lab.study import Plan, plan_study, save
+from kerv_cli.lab.study import Plan, is_elsewhere, plan_study, save
 from kerv_cli.lab.work import OnEvent, Outcome, Prepare, RunEpisode, follow
 from kerv_cli.lab.workers import begun, workers
 from kerv_cli.worlds import settled
 from kerv_cli.worlds.metaworld.spec import SPEC
 
-if TYPE_CHECKING:
-    import altair as alt
-    import pandas as pd
-
 TOKENS = 16
-NOWHERE = Database("nowhere")
 IDENTITY = {"target": "a" * 64, "drafter": "b" * 64}
 
 
@@ -94,7 +89,7 @@ def study_of(
     )
     about = {"baseline": "ar", "title": "Acceptance threshold", "axis": "threshold.r"} | about
     episodes = all_episodes(made, tasks, block)
-    return Study(NOWHERE, name, "sweep", made, episodes, block=block, **about)
+    return Study(Database("nowhere"), name, "sweep", made, episodes, block=block, **about)
 
 
 def planned(database: Database, study: Study, *arguments: Any, **options: Any) -> Plan:
@@ -123,7 +118,7 @@ def swept(
     plan = planned(opened(results), study, rerun, runtime=runtime, command=command)
     prepare = prepare or episodes_of
     # variables of a process are set for its worker processes alone: two threads that sweep would restore each other's
-    in_others = plan.is_elsewhere or plan.runtime.workers > 1
+    in_others = is_elsewhere(plan.runtime) or plan.runtime.workers > 1
     with begun(plan) as record, pretending(prepare) if in_others else contextlib.nullcontext():
         save(plan, record.id)
         with workers(plan, record.id) as tend:
@@ -206,35 +201,29 @@ def episodes_of(setting: Setting, task: str) -> RunEpisode:
     return lambda seed: episode(setting, task, seed)
 
 
-def count_calls() -> tuple[Prepare, list[str]]:
-    """episodes_of, and the list of the labels that it was called for."""
-    calls: list[str] = []
+def slowly(setting: Setting, task: str, seconds: float) -> RunEpisode:
+    """So many seconds for each episode."""
 
-    def counted(setting, task):
-        calls.append(setting.label)
-        return episodes_of(setting, task)
+    def run(seed):
+        time.sleep(seconds)
+        return episode(setting, task, seed)
 
-    return counted, calls
+    return run
 
 
 def unhurried(setting: Setting, task: str) -> RunEpisode:
     """A tenth of a second for each episode."""
-
-    def run(seed):
-        time.sleep(0.1)
-        return episode(setting, task, seed)
-
-    return run
+    return slowly(setting, task, 0.1)
 
 
 def brisk(setting: Setting, task: str) -> RunEpisode:
     """A hundredth of a second for each episode."""
+    return slowly(setting, task, 0.01)
 
-    def run(seed):
-        time.sleep(0.01)
-        return episode(setting, task, seed)
 
-    return run
+def slow_elsewhere(setting: Setting, task: str) -> RunEpisode:
+    """The first task at once, every other in a minute."""
+    return slowly(setting, task, 0.0 if task == "reach-v3" else 60.0)
 
 
 def mortal(setting: Setting, task: str) -> RunEpisode:
@@ -252,37 +241,27 @@ def mortal(setting: Setting, task: str) -> RunEpisode:
 _begun: list[int] = []
 
 
-def stops(setting: Setting, task: str) -> RunEpisode:
-    """Stops its process in an episode, until somebody lets it go on."""
+def struck_at_the_third(setting: Setting, task: str, number: int) -> RunEpisode:
+    """Sends its process a signal in an episode."""
 
     def run(seed):
         if (setting.label, seed) == ("ar", 100_002):
-            os.kill(os.getpid(), signal.SIGSTOP)
+            os.kill(os.getpid(), number)
         return episode(setting, task, seed)
 
     return run
+
+
+def stops(setting: Setting, task: str) -> RunEpisode:
+    """Stops its process in an episode, until somebody lets it go on."""
+    return struck_at_the_third(setting, task, signal.SIGSTOP)
 
 
 def killed_at_the_third(setting: Setting, task: str) -> RunEpisode:
-    def run(seed):
-        if (setting.label, seed) == ("ar", 100_002):
-            os.kill(os.getpid(), signal.SIGKILL)
-        return episode(setting, task, seed)
-
-    return run
+    return struck_at_the_third(setting, task, signal.SIGKILL)
 
 
-def slow_elsewhere(setting: Setting, task: str) -> RunEpisode:
-    """The first task at once, every other in a minute."""
-
-    def run(seed):
-        time.sleep(0.0 if task == "reach-v3" else 60.0)
-        return episode(setting, task, seed)
-
-    return run
-
-
-def points_of(figure: alt.ConcatChart) -> list[pd.DataFrame]:
+def points_of(figure: Any) -> list[Any]:
     """The points of each panel of a chart, as a browser gets them."""
     import pandas as pd
 

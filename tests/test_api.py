@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import refused
-from studies_synthetic import swept, threshold_study
 
 import kerv_cli as kerv
 from kerv_cli.base.config import as_overrides
@@ -16,15 +15,14 @@ from kerv_cli.base.config import as_overrides
 pytestmark = pytest.mark.usefixtures("quick_report")
 
 ROOT = Path(__file__).resolve().parents[1]
-SHORT: dict[str, Any] = {"task": "reach", "episodes": 1, "record": 0, "world": {"horizon": 6}}
 
 
 @pytest.fixture(scope="module")
 def mine(policies, tmp_path_factory):
     """Settings of a short episode of an untrained policy, in a results folder of this module."""
+    short = {"task": "reach", "episodes": 1, "record": 0, "world": {"horizon": 6}}
     target = policies / "artifacts" / "target" / "nano-state"
-    results = tmp_path_factory.mktemp("library") / "results"
-    return {**SHORT, "policy": {"target": target}, "results": results}
+    return {**short, "policy": {"target": target}, "results": tmp_path_factory.mktemp("library") / "results"}
 
 
 @pytest.fixture(scope="module")
@@ -81,14 +79,10 @@ def test_a_study_is_run_once_reported_and_loaded(study, mine):
     assert {"both.csv", "both_per_task.csv", "report.html"} <= files
 
 
-def test_a_sweep_reports_from_the_database_that_was_named(mine, tmp_path):
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    path, results = mine["results"].parent / "both.yaml", tmp_path / "results"
-    path.write_text("settings: {ar: method=ar, hold: method=spec_vla proposer=hold}\n", encoding="utf-8")
-    store = f"sqlite:///{elsewhere}/other.db"
-    kerv.sweep(path, **{**mine, "results": results, "store": store})
-    loaded = kerv.load_study("both", results=results, store=store)
+def test_a_sweep_reports_from_the_database_that_was_named(study, mine, tmp_path):
+    results, store = tmp_path / "results", f"sqlite:///{tmp_path}/other.db"
+    kerv.sweep(mine["results"].parent / "both.yaml", **{**mine, "results": results, "store": store})
+    loaded = kerv.load_study(study.name, results=results, store=store)
     assert "report.html" in {file.name for file in loaded.report()}
     assert loaded.to_pandas()["episodes"].tolist() == [1, 1]
     assert not list(results.glob("*.db"))
@@ -112,12 +106,6 @@ def test_a_policy_answers_observations(mine):
     assert np.array_equal(policy.act(seen), actions)
 
 
-def test_an_unknown_study_is_named(tmp_path):
-    swept(tmp_path, threshold_study(["reach-v3"]))
-    with refused("unknown run 'other'"):
-        kerv.load_study("other", results=tmp_path)
-
-
 @pytest.mark.parametrize(
     ("call", "says"),
     [
@@ -125,9 +113,10 @@ def test_an_unknown_study_is_named(tmp_path):
         (lambda mine: kerv.sweep("dmeo", **mine), "unknown study 'dmeo': did you mean demo"),
         (lambda mine: kerv.runs(mine["results"], colour="red"), "unknown filter 'colour'"),
         (lambda mine: kerv.load_policy("absent", results=mine["results"]), "no target 'absent'"),
+        (lambda mine: kerv.load_study("other", results=mine["results"]), "unknown run 'other'"),
     ],
 )
-def test_a_wrong_request_is_an_exception_of_one_line(call, says, mine):
+def test_a_wrong_request_is_an_exception_of_one_line(call, says, run, mine):
     with refused(says):
         call(mine)
 

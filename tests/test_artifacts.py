@@ -106,21 +106,6 @@ def test_a_study_loads_and_hashes_everything_once(results, monkeypatch):
     assert len({id(decoder) for decoder in decoders}) == len(decoders)  # the state of an episode is a decoder's own
 
 
-def test_only_what_is_needed_is_read(results):
-    for kind in FILES:
-        shutil.rmtree(results / "artifacts" / kind)
-    check(settings_of(results, "method=ar"))
-    check(settings_of(results, "method=jacobi"))
-    for overrides, missing in (
-        ("method=spec_vla", "drafter"),
-        ("method=spec_vla proposer=retrieval", "datastore"),
-        ("method=spec_vla proposer=kalman", "calibration"),
-        ("method=one_pass", "early"),
-    ):
-        with refused(f"no {missing}", error=CheckpointError):
-            check(settings_of(results, overrides))
-
-
 def test_a_changed_file_is_another_artifact(results):
     asked = settings_of(results, "method=spec_vla proposer=retrieval")
     files = Artifacts(asked.results, asked.policy)

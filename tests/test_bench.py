@@ -16,11 +16,11 @@ from flips import flipped
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.bench import measure as measuring
-from kerv_cli.bench.measure import Laps, Phase, costs_of, decoders, measure, profile_of
+from kerv_cli.bench.measure import Phase, costs_of, decoders, measure, profile_of
 from kerv_cli.bench.model import open_model
 from kerv_cli.bench.physics import Sizes
 from kerv_cli.bench.settings import BenchSettings
-from kerv_cli.engine.decoder import Decoder, Parts
+from kerv_cli.engine.decoder import Decoder, Parts, Stopwatch
 from kerv_cli.episodes.cost import READ_PHASES, Profile, Work, prices, read_profile, work_of, work_of_record
 from kerv_cli.methods.eagle.drafter import DrafterProposer
 from kerv_cli.targets.openvla.config import Language
@@ -172,7 +172,7 @@ def test_decodes_of_all_sizes_show_what_each_part_costs(dtype):
     prompt = model.target.encode(model.observation)
     length = prompt.shape[1]
     for decoder in decoders(model):
-        clock = Laps(model.target.device)
+        clock = Stopwatch(model.target.device)
         clock.lap("vision")
         chunk = decoder.decode_prompt(prompt, clock)
         clock.stop()

@@ -90,28 +90,6 @@ def test_settings_survive_a_file(method):
         assert type(getattr(again, kind)) is type(part)
 
 
-@pytest.mark.parametrize(
-    ("overrides", "says"),
-    [
-        ("method=spec_vla boundary=fused", "proposer=drafter with boundary=fused"),
-        ("method=one_pass prefill_draft.sources=[early,nope]", "source of a merged draft 'nope'"),
-        ("method=one_pass prefill_draft.sources=[]", "name at least one of sources"),
-        ("prefill_draft.kind=drafter", "prefill_draft=drafter"),
-        ("chunk=5", "trained for 4 control steps"),
-        ("proposer.kind=nope", "proposer.kind 'nope'"),
-        ("proposer=drafter proposer.kind=hold", "choose proposer=hold"),
-        ("rectifier=compensate rectifier.predictor=nope", "rectifier.predictor 'nope'"),
-        ("rectifier=compensate_draft rectifier.use_target_token=false", "leave rectifier.use_target_token=true"),
-        ("skip=always", "skip=always with prefill_draft=none: it executes a draft from before the prefill"),
-        ("method=spec_vla threshold.r=255", "threshold.r=255: bins from 0 to 254"),
-        ("method=kerv threshold.r_max=255", "threshold.r_max=255: bins from 0 to 254"),
-    ],
-)
-def test_what_does_not_belong_together_is_refused(overrides, says):
-    with refused(says):
-        Method.of(composed(*overrides.split())).check(SimpleNamespace(chunk=4, actions=SPEC.actions))
-
-
 def test_only_what_needs_no_states_can_be_chosen_before_the_prefill():
     before = groups()["prefill_draft"]
     assert {"none", "early", "hold", "kalman", "retrieval", "merged"} <= set(before)
@@ -127,6 +105,17 @@ def test_only_what_needs_no_states_can_be_chosen_before_the_prefill():
 @pytest.mark.parametrize(
     ("overrides", "says"),
     [
+        ("method=spec_vla boundary=fused", "proposer=drafter with boundary=fused"),
+        ("method=one_pass prefill_draft.sources=[early,nope]", "source of a merged draft 'nope'"),
+        ("method=one_pass prefill_draft.sources=[]", "name at least one of sources"),
+        ("prefill_draft.kind=drafter", "prefill_draft=drafter"),
+        ("chunk=5", "trained for 4 control steps"),
+        ("proposer.kind=nope", "proposer.kind 'nope'"),
+        ("rectifier=compensate rectifier.predictor=nope", "rectifier.predictor 'nope'"),
+        ("rectifier=compensate_draft rectifier.use_target_token=false", "leave rectifier.use_target_token=true"),
+        ("skip=always", "skip=always with prefill_draft=none: it executes a draft from before the prefill"),
+        ("method=spec_vla threshold.r=255", "threshold.r=255: bins from 0 to 254"),
+        ("method=kerv threshold.r_max=255", "threshold.r_max=255: bins from 0 to 254"),
         ("policy=expert skip=similarity", "policy=expert with skip=similarity: the expert decodes nothing"),
         ("policy=expert deviation_every=5", "deviation_every=5: the expert decodes nothing"),
         ("policy.kind=exprt", "unknown policy.kind 'exprt': did you mean expert"),
@@ -162,8 +151,7 @@ def test_a_rollout_that_cannot_be_is_refused(overrides, says):
     ],
 )
 def test_a_method_needs_what_its_parts_read_and_nothing_else(overrides, wanted):
-    assert set(Method.of(composed(*overrides.split())).needs) == set(wanted)
-    assert len(Method.of(composed(*overrides.split())).needs) == len(wanted)
+    assert sorted(Method.of(composed(*overrides.split())).needs) == sorted(wanted)
 
 
 # --- effects
@@ -172,7 +160,6 @@ def test_a_method_needs_what_its_parts_read_and_nothing_else(overrides, wanted):
 @pytest.mark.parametrize(
     ("words", "idle"),
     [
-        ("method=ar acceptance=relaxed", "acceptance=relaxed"),
         ("method=spec_vla threshold.r=5", ""),
         ("method=spec_vla acceptance=sequence threshold.r=5", "threshold.r=5"),
         ("method=spec_vla policy.artifacts.datastore=mine", "policy.artifacts.datastore=mine"),

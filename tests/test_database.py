@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import json
-import os
 import resource
 import signal
 import sqlite3
@@ -16,7 +15,7 @@ import pytest
 import sqlalchemy as sa
 from command import kerv, told
 from conftest import python, refused, until
-from studies_synthetic import episode, settings_of, still_episode, study_of, swept, threshold_study
+from studies_synthetic import episode, settings_of, study_of, swept, threshold_study
 
 from kerv_cli.base.errors import CheckpointError, StorageError, UsageError
 from kerv_cli.episodes.rows import decodes_table, episode_row
@@ -49,14 +48,6 @@ def begun(database: Database, name: str) -> None:
             connection.execute(STUDIES.insert().values(name=name, kind="sweep", created="", about={}))
 
 
-def change(results: Path, *statements: str) -> None:
-    """Change a database as another program might."""
-    with contextlib.closing(sqlite3.connect(results / FILE)) as file:
-        for statement in statements:
-            file.execute(statement)
-        file.commit()
-
-
 @pytest.fixture(scope="module")
 def damageable(tmp_path_factory):
     """Bytes of a database with a study."""
@@ -87,16 +78,6 @@ def test_an_episode_comes_back_as_it_was(database):
         assert row["device_name"]
         assert decodes_of(store, [row["episode"]]).drop_columns("episode").equals(decodes_table(record))
     assert loaded(store).settings[0].settings == study_of({"ar": settings_of("ar")}, ["reach-v3"]).settings[0].settings
-
-
-def test_what_is_no_number_is_stored_as_unknown(database):
-    def run(seed):
-        deviates = dataclasses.replace(episode(STUDY.settings[0], "reach-v3", seed).decodes[0], deviation=float("nan"))
-        return still_episode("reach-v3", seed, False, [deviates])
-
-    store, outcome = swept(database.results, study_of({"ar": settings_of("ar")}, ["reach-v3"]), lambda *_: run)
-    assert len(outcome.done) == 4
-    assert frame_of(store)["deviation_sum"].isna().all()
 
 
 def test_a_failed_transaction_leaves_nothing(database):
@@ -171,14 +152,7 @@ def test_a_kill_in_a_transaction_leaves_nothing(database, tmp_path):
     assert count(database, STUDIES) == 2
 
 
-@pytest.mark.parametrize(
-    ("schema", "message"),
-    [
-        ("1", "schema 2, this one reads 1"),
-        ("99", "of another kerv (schema 2, this one reads 99): choose another folder"),
-    ],
-)
-def test_tables_of_another_kerv_are_refused(database, monkeypatch, schema, message):
+def test_tables_of_another_kerv_are_refused(database, monkeypatch):
     begun(database, "a")
     monkeypatch.setattr(module, "SCHEMA", "99")
     with refused("of another kerv (schema 2, this one reads 99): choose another folder", error=CheckpointError):
@@ -212,20 +186,24 @@ def test_a_damaged_file_is_one_line(tmp_path, harm):
     assert "Traceback" not in result.output
 
 
-def test_an_error_text_and_a_state_that_databases_refuse_are_stored(database):
+def test_an_error_text_and_numbers_that_databases_refuse_are_stored(database):
     study = study_of({"ar": settings_of("ar"), "naive_sd": settings_of("naive_sd")}, ["reach-v3"])
 
     def run(setting, task):
         def run_episode(seed):
-            if setting.label == "ar":
-                return dataclasses.replace(episode(setting, task, seed), initial_state=np.array([np.nan, np.inf, 1.5]))
-            raise ValueError("a\0b \udc80")
+            if setting.label != "ar":
+                raise ValueError("a\0b \udc80")
+            record = episode(setting, task, seed)
+            decodes = (dataclasses.replace(record.decodes[0], deviation=np.nan), *record.decodes[1:])
+            return dataclasses.replace(record, decodes=decodes, initial_state=np.array([np.nan, np.inf, 1.5]))
 
         return run_episode
 
     store, outcome = swept(database.results, study, run)
     assert [len(failure.episodes) for failure in outcome.failed] == [4]
-    assert frame_of(store)["initial_state"].tolist() == [(None, None, 1.5)] * 4
+    frame = frame_of(store)
+    assert frame["initial_state"].tolist() == [(None, None, 1.5)] * 4
+    assert frame["deviation_sum"].isna().all()
     with database.reading() as connection:
         errors = set(connection.scalars(sa.select(WANTED.c.error).where(WANTED.c.error.is_not(None))))
     assert all(r"a\x00b \udc80" in error for error in errors)
@@ -235,28 +213,8 @@ def test_an_error_text_and_a_state_that_databases_refuse_are_stored(database):
 
 
 @pytest.mark.parametrize("database", ["postgresql"], indirect=True)
-def test_a_server_that_freezes_is_one_line(database, monkeypatch):
-    monkeypatch.setattr("kerv_cli.lab.postgresql.STATEMENT_SECONDS", 1)
-    monkeypatch.setattr("kerv_cli.lab.postgresql._SPARE_SECONDS", 0)
-    begun(database, "a")
-    frozen = []
-    try:
-        with (
-            refused("no answer for 1 s", "check that the server", error=StorageError),
-            database.reading() as connection,
-        ):
-            frozen.append(connection.scalar(sa.text("SELECT pg_backend_pid()")))
-            os.kill(frozen[0], signal.SIGSTOP)
-            connection.scalar(sa.text("SELECT 1"))
-        assert len(studies(database)) == 1  # over a new connection
-    finally:
-        for pid in frozen:
-            os.kill(pid, signal.SIGCONT)
-
-
-@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 def test_a_statement_that_takes_too_long_ends(database, monkeypatch):
-    monkeypatch.setattr("kerv_cli.lab.postgresql.STATEMENT_SECONDS", 1)
+    monkeypatch.setattr("kerv_cli.lab.database.STATEMENT_SECONDS", 1)
     with refused("statement timeout", error=StorageError), database.reading() as connection:
         connection.execute(sa.text("SELECT pg_sleep(20)"))
     with refused("refused a statement", "check the rights", error=StorageError), database.reading() as connection:
@@ -265,7 +223,7 @@ def test_a_statement_that_takes_too_long_ends(database, monkeypatch):
 
 @pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 def test_a_suspended_transaction_lets_others_write(database, monkeypatch):
-    monkeypatch.setattr("kerv_cli.lab.postgresql.IDLE_SECONDS", 1)
+    monkeypatch.setattr("kerv_cli.lab.database.IDLE_SECONDS", 1)
     number = sa.select(sa.func.count()).select_from(RUNS)
     with refused("failed", "check that the server runs", error=Unanswered), database.writing() as suspended:
         suspended.execute(sa.text("LOCK TABLE runs"))
@@ -284,7 +242,8 @@ def test_a_suspended_transaction_lets_others_write(database, monkeypatch):
 def test_a_damaged_row_is_one_line(damageable, tmp_path, row):
     table, _, change_of = row.partition(".")
     (tmp_path / FILE).write_bytes(damageable)
-    change(tmp_path, f"UPDATE {table} SET {change_of} WHERE rowid = (SELECT min(rowid) FROM {table})")
+    with contextlib.closing(sqlite3.connect(tmp_path / FILE)) as file, file:
+        file.execute(f"UPDATE {table} SET {change_of} WHERE rowid = (SELECT min(rowid) FROM {table})")
     refusals = [
         kerv(*words, f"results={tmp_path}", code=None) for words in (["runs", "list"], ["report", "study=threshold"])
     ]

@@ -15,6 +15,7 @@ from examples.point_mass import SPEC, PointWorld
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError
 from kerv_cli.base.spaces import Observation
+from kerv_cli.engine.chunk import Follower
 from kerv_cli.engine.record import PHASES, DecodeRecord, Delay, EpisodeRecord, Round
 from kerv_cli.episodes import policy as policies_of
 from kerv_cli.episodes import runner as run
@@ -95,38 +96,20 @@ def test_deviation_is_sampled_and_zero_for_ar_itself(policies):
 
 
 HZ = SPEC.actions.control_hz
-TASK = "drawer-open-v3"
 
 
-class Numbered:
-    """Its chunks are numbered: action `i` of decode `n` is (n, i) in hundredths of the limits. It remembers what it was
-    shown and told."""
+class Numbered(Follower):
+    """Its chunks of four are numbered: action `i` of decode `n` is (n, i) in hundredths of the limits."""
 
-    cameras = ()
-
-    def __init__(self, chunk: int = 4, seconds: Callable[[int], float] = lambda n: 0.0) -> None:
-        self.chunk, self.seconds = chunk, seconds
-        self.shown: list[Observation] = []
-        self.told: list[np.ndarray] = []
-
-    def reset(self, task: str, seed: int, end_effector: np.ndarray) -> None:
-        """Begins an episode."""
-        self.shown, self.told = [], []
+    def __init__(self, seconds: Callable[[int], float] = lambda n: 0.0) -> None:
+        super().__init__(SPEC.actions)
+        self.seconds, self.number = seconds, 0
 
     def decode(self, observation: Observation) -> DecodeRecord:
         """The next numbered chunk."""
-        self.shown.append(observation)
-        number = len(self.shown)
-        actions = np.array([(number, i) for i in range(self.chunk)], np.float32) / 2000
-        seconds = self.seconds(number)
-        return DecodeRecord((), actions, 0, (), "ar", seconds, {})
-
-    def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
-        """Remembers it."""
-        self.told.append(action)
-
-    def finish(self, success: bool) -> None:
-        """Nothing to learn."""
+        self.number += 1
+        actions = np.array([(self.number, i) for i in range(4)], np.float32) / 2000
+        return DecodeRecord((), actions, 0, (), "ar", self.seconds(self.number), {})
 
 
 def played(record: EpisodeRecord) -> list[tuple[int, int]]:
@@ -178,13 +161,13 @@ def test_the_chunk_before_is_executed_on_and_then_its_last_action_is_held(steps,
 def test_a_fake_clock_says_how_long_each_decode_took():
     """Measured seconds, rounded up; a decode begins as early as the one before took long."""
     seconds = {1: 0.11, 2: 0.31, 3: 0.05}
-    decoder = Numbered(4, lambda n: seconds.get(n, 0.2))
+    decoder = Numbered(lambda n: seconds.get(n, 0.2))
     record = point_episode(RealClock(lambda decode: decode.seconds, SPEC.actions), decoder)
     delays = [d.delay for d in record.decodes[:4] if d.delay is not None]
     assert [d.steps for d in delays] == [2, 4, 1, 2]
     assert [d.seconds for d in delays] == [0.11, 0.31, 0.05, 0.2]
     assert [(d.observed, d.carried, d.held) for d in delays] == [(0, 0, 2), (4, 2, 2), (8, 1, 0), (12, 1, 1)]
-    assert len(decoder.told) == record.steps  # held actions are part of the history
+    assert len(decoder.path) == record.steps + 1  # held actions are part of the history
 
 
 def test_an_episode_can_end_while_the_policy_decodes():
@@ -217,7 +200,7 @@ def test_chunk_drops_what_is_stale():
     record = point_episode(constant(2, "chunk"))
     assert played(record)[:8] == [(0, 0), (0, 0), (1, 2), (1, 3), (2, 2), (2, 3), (3, 2), (3, 3)]
     assert {d.delay.dropped for d in record.decodes if d.delay} == {2}
-    slow = point_episode(RealClock(lambda decode: decode.seconds, SPEC.actions, "chunk"), Numbered(4, lambda n: 0.6))
+    slow = point_episode(RealClock(lambda decode: decode.seconds, SPEC.actions, "chunk"), Numbered(lambda n: 0.6))
     assert played(slow)[6:12] == [(1, 3)] * 6  # the last action of a chunk is always left
     assert slow.decodes[0].delay == Delay(0.6, 6, 0, carried=0, held=6, dropped=3)
 
@@ -282,13 +265,13 @@ def test_a_profile_prices_the_records_forwards():
     assert profiled(PROFILE)(drafted) == pytest.approx(wanted)
 
 
-def profile_file(folder: Path, **phases: Any) -> Path:
+def profile_file(folder: Path, **phases: tuple[list[Any], list[Any]]) -> None:
+    """phases: other rows and seconds than those of `PROFILE`."""
     document = {"profile": PROFILE.as_dict()}
-    document["profile"]["phases"] |= phases
+    document["profile"]["phases"] |= {name: {"rows": costs[0], "seconds": costs[1]} for name, costs in phases.items()}
     path = folder / "bench" / "there.json"
     path.parent.mkdir(exist_ok=True)
     path.write_text(json.dumps(document))
-    return path
 
 
 @pytest.fixture
@@ -314,7 +297,7 @@ def test_a_profile_is_part_of_the_results_identity(results):
     chosen = compose("rollout", [*words, "rollout.profile=there"], RolloutSettings)
     found = []
     for seconds in (0.005, 0.006):
-        profile_file(results, encode={"rows": [1], "seconds": [seconds]})
+        profile_file(results, encode=([1], [seconds]))
         found.append(policies_of.check(chosen)["profile"])
     assert found[0] != found[1]
     assert "profile" not in policies_of.check(dataclasses.replace(chosen, rollout=RolloutSettings().rollout))
@@ -324,46 +307,30 @@ def test_a_profile_is_part_of_the_results_identity(results):
 
 CONSTANT = "rollout.clock=real rollout.latency=constant"
 FROM_PROFILE = "rollout.clock=real rollout.latency=profile rollout.profile=there"
+COMPENSATED = "rollout.delay_compensation=chunk"
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("words", "phases", "message"),
     [
-        (f"{CONSTANT} rollout.latency_ms=nan", "rollout.latency_ms=nan: from 0"),
-        (f"{CONSTANT} rollout.latency_ms=6250", "500 control steps, but an episode has 500"),
-        (
-            f"{CONSTANT} rollout.latency_ms=50 rollout.delay_compensation=chunk",
-            "all 4 control steps of a chunk are stale",
-        ),
-        (f"{CONSTANT} rollout.latency_ms=13 rollout.delay_compensation=chunk chunk=2", "all 2 control steps"),
-        ("rollout.clock=real rollout.latency=profile", "name a document of 'kerv bench"),
-        (FROM_PROFILE.replace("there", "nowhere"), "rollout.profile=nowhere: no such document"),
-        (f"{FROM_PROFILE} method=spec_vla", "has no phase 'draft', which this method needs"),
-        (f"{CONSTANT} rollout.latency_ms=20 policy=expert rollout.delay_compensation=chunk", "all 1 control steps"),
-        (f"{FROM_PROFILE} policy=expert", "it has no forwards"),
+        (f"{CONSTANT} rollout.latency_ms=nan", {}, "rollout.latency_ms=nan: from 0"),
+        (f"{CONSTANT} rollout.latency_ms=6250", {}, "500 control steps, but an episode has 500"),
+        (f"{CONSTANT} rollout.latency_ms=50 {COMPENSATED}", {}, "all 4 control steps of a chunk are stale"),
+        (f"{CONSTANT} rollout.latency_ms=13 {COMPENSATED} chunk=2", {}, "all 2 control steps"),
+        ("rollout.clock=real rollout.latency=profile", {}, "name a document of 'kerv bench"),
+        (FROM_PROFILE.replace("there", "nowhere"), {}, "rollout.profile=nowhere: no such document"),
+        (f"{FROM_PROFILE} method=spec_vla", {"draft": ([], [])}, "has no phase 'draft', which this method needs"),
+        (f"{CONSTANT} rollout.latency_ms=20 policy=expert {COMPENSATED}", {}, "all 1 control steps"),
+        (f"{FROM_PROFILE} policy=expert", {}, "it has no forwards"),
+        (FROM_PROFILE, {"encode": ([1], [-0.1])}, "impossible times of the phase 'encode'"),
+        (FROM_PROFILE, {"verify": ([1], [float("nan")])}, "impossible times of the phase 'verify'"),
+        (FROM_PROFILE, {"verify": ([2, 1], [1, 1])}, "impossible times of the phase 'verify'"),
+        (FROM_PROFILE, {"prefill": ([1, 2], [1])}, "impossible times of the phase 'prefill'"),
+        (FROM_PROFILE, {"prefill": ([], [])}, "has no phase 'prefill'"),
+        (FROM_PROFILE, {"prefill": ([1], ["x"])}, "holds no latency profile"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(results, words, message):
-    profile_file(results, draft={"rows": [], "seconds": []})
-    assert_refused(results, words, message)
-
-
-def assert_refused(results: Path, words: str, message: str) -> None:
-    target = [] if "expert" in words else ["policy.target=nano-state"]
-    assert message in refusal("rollout", f"task={TASK}", f"results={results}", *target, *words.split(), code=2)
-
-
-@pytest.mark.parametrize(
-    ("phases", "message"),
-    [
-        ({"encode": {"rows": [1], "seconds": [-0.1]}}, "impossible times of the phase 'encode'"),
-        ({"verify": {"rows": [1], "seconds": [float("nan")]}}, "impossible times of the phase 'verify'"),
-        ({"verify": {"rows": [2, 1], "seconds": [1, 1]}}, "impossible times of the phase 'verify'"),
-        ({"prefill": {"rows": [1, 2], "seconds": [1]}}, "impossible times of the phase 'prefill'"),
-        ({"prefill": {"rows": [], "seconds": []}}, "has no phase 'prefill'"),
-        ({"prefill": {"rows": [1], "seconds": ["x"]}}, "holds no latency profile"),
-    ],
-)
-def test_an_impossible_profile_is_refused(results, phases, message):
+def test_what_cannot_be_is_refused_in_one_line(results, words, phases, message):
     profile_file(results, **phases)
-    assert_refused(results, FROM_PROFILE, message)
+    target = [] if "expert" in words else ["policy.target=nano-state"]
+    assert message in refusal("rollout", "task=drawer-open", f"results={results}", *target, *words.split(), code=2)

@@ -19,7 +19,6 @@ from conftest import python, raising, refused, until
 from examples.point_mass import SPEC as POINT_MASS
 from studies_synthetic import (
     brisk,
-    count_calls,
     episode,
     episodes_of,
     part,
@@ -32,7 +31,6 @@ from studies_synthetic import (
 )
 
 from kerv_cli.base.errors import Interrupted, KervError, StorageError, UsageError
-from kerv_cli.base.registry import _PARTS, parts
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.cli.common import progress_bar
 from kerv_cli.cli.studies import event_printer
@@ -137,9 +135,8 @@ def test_the_settings_of_a_block_take_turns_in_a_recorded_order(database):
     assert list(zip(table["label"], table["seed"], strict=True)) == ran
     assert list(table["order"]) == [*range(20), *range(8)]
     assert table["block"].nunique() == 2
-    run, calls = count_calls()
-    _, outcome = swept(database.results, study, run)
-    assert calls == outcome.done == []
+    _, outcome = swept(database.results, study, lambda *_: pytest.fail("prepared"))
+    assert outcome.done == []
     assert len(outcome.reused) == 28
 
 
@@ -469,8 +466,7 @@ for workers, block in ((1, 5), (2, 2), (4, 1)):
     episodes = s.all_episodes(study.settings, ["reach-v3"], block)
     study = s.replace(study, episodes=episodes)
     save(s.planned(opened(results), study))
-    died = crew(Study(opened(results), study.name), workers)
-    print(study.name, died)
+    crew(Study(opened(results), study.name), workers)
 """
 
 
@@ -543,8 +539,7 @@ settings: {short: world.horizon=30, long: world.horizon=60}
 
 def test_workers_run_each_episode_once_though_one_is_killed(tmp_path, monkeypatch):
     """A worker that dies is replaced, and the episode that it ran is repeated."""
-    part = EnvironmentPart("point-mass", code=lambda: POINT_MASS)
-    monkeypatch.setitem(_PARTS, "environment", {**parts("environment"), part.name: part})
+    EnvironmentPart(POINT_MASS.name)(lambda: POINT_MASS)
     (tmp_path / "killing.py").write_text(KILLS_ITS_PROCESS_ONCE)
     (tmp_path / "armed").touch()
     monkeypatch.setenv("KERV_PLUGINS", "killing")

@@ -11,7 +11,6 @@ import pytest
 from examples.point_mass import SPEC as POINT
 from rerun_synthetic import read_recording
 
-from kerv_cli.base import registry
 from kerv_cli.base.config import compose
 from kerv_cli.base.errors import KervError, UnknownName, UsageError
 from kerv_cli.base.spaces import Observation
@@ -30,7 +29,6 @@ from kerv_cli.worlds.settings import EVALUATION_SEED, CameraSettings
 from kerv_cli.worlds.spec import World
 
 NAME = "window-close-v3"
-STAMPS = {"device": "cpu", "device_name": "x", "dtype": "float32", "threads": 1, "run": "r"}
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +62,8 @@ def test_rows_keep_it_and_measures_are_undefined_instead_of_divided_by_zero(epis
     assert third["actions"] == episode.decodes[3].actions.tolist()
     assert (third["mode"], third["tokens"], third["rounds"]) == ("expert", [], [])
     frame = pd.DataFrame([row | {"task": NAME, "seed": EVALUATION_SEED, "block": "b"}])
-    frame = frame.assign(initial_state=str(row["initial_state"]), **STAMPS)
+    stamps = {"device": "cpu", "device_name": "x", "dtype": "float32", "threads": 1, "run": "r"}
+    frame = frame.assign(initial_state=str(row["initial_state"]), **stamps)
     frame["decode_seconds"] = [np.array([decode.seconds for decode in episode.decodes])]
     slow = frame.assign(label="slow", seconds=frame["seconds"] * 10, success=False)
     episodes = pd.concat([frame.assign(label="own"), slow], ignore_index=True)
@@ -99,8 +98,6 @@ def test_it_follows_the_task_and_refuses_what_it_cannot_answer():
     state = np.random.default_rng(0).uniform(0, 0.3, 39)
     decoder = ExpertDecoder(NAME)
     assert (decoder.decode(seen(state)).actions != ExpertDecoder("drawer-open-v3").decode(seen(state)).actions).any()
-    with pytest.raises(KervError, match="a state it cannot read"):
-        decoder.decode(seen(np.full(39, np.nan)))
     with pytest.raises(UnknownName, match="window-close"):
         ExpertDecoder("window-clos")
 
@@ -197,9 +194,8 @@ def test_what_ours_did_is_told_from_what_metaworlds_did():
 # --- example environment
 
 
-def test_an_episode_runs_and_is_recorded(tmp_path, monkeypatch):
-    part = EnvironmentPart(POINT.name, code=lambda: POINT)
-    monkeypatch.setitem(registry._PARTS, "environment", {**registry.parts("environment"), POINT.name: part})
+def test_an_episode_runs_and_is_recorded(tmp_path):
+    EnvironmentPart(POINT.name)(lambda: POINT)
     with POINT.open_world("push-point") as world:
         record = run_episode(world, ExpertDecoder(world.task), 100_000, CameraSettings(size=24))
         world.reset(100_000)

@@ -123,17 +123,12 @@ def test_a_file_appears_complete_and_nothing_else_stays(tmp_path):
     assert path.stat().st_mode & 0o777 == 0o666 & ~umask
 
 
-def write_half(path):
-    with atomic_path(path) as temporary:
-        temporary.write_text("half")
-        raise KeyboardInterrupt
-
-
 def test_an_interrupted_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "value.txt"
     path.write_text("old")
-    with pytest.raises(KeyboardInterrupt):
-        write_half(path)
+    with pytest.raises(KeyboardInterrupt), atomic_path(path) as temporary:  # noqa: PT012
+        temporary.write_text("half")
+        raise KeyboardInterrupt
     assert path.read_text() == "old"
     assert [entry.name for entry in tmp_path.iterdir()] == ["value.txt"]
 

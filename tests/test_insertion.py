@@ -21,45 +21,27 @@ from kerv_cli.worlds.demos.dataset import DemoDataset
 from kerv_cli.worlds.demos.recording import DemoConfig, record
 from kerv_cli.worlds.findings import Finding
 from kerv_cli.worlds.settings import CameraSettings
-from kerv_cli.worlds.spec import World
 
 TASKS = tuple(SPEC.tasks)
 ROTATION = slice(3, 6)
 SMALL = CameraSettings(size=48, supersample=1)
 
 
-def outcome(world: World, seed: int, turn: bool = True) -> tuple[bool, np.ndarray]:
-    """Whether the expert succeeds, with or without its rotations, and the states on the way."""
-    expert, observation = SPEC.expert(world.task), world.reset(seed)
-    states = [observation.state]
-    while not world.done:
-        action = expert(observation)
-        action[ROTATION] *= turn
-        observation = world.step(action)
-        states.append(observation.state)
-    return world.succeeded, np.array(states)
-
-
 @pytest.mark.parametrize("task", TASKS)
-def test_the_expert_succeeds_and_nobody_who_does_not_turn(task):
+def test_the_expert_succeeds(task):
     with SPEC.open_world(task) as world:
-        assert np.mean([outcome(world, seed)[0] for seed in range(8)]) == 1.0
-        for seed in range(2):
-            success, states = outcome(world, seed, turn=False)
-            assert not success
-            assert states[:, 2].min() > 0.03  # the hand was never pushed through anything
+        for seed in range(8):
+            expert, observation = SPEC.expert(task), world.reset(seed)
+            while not world.done:
+                observation = world.step(expert(observation))
+            assert world.succeeded
 
 
-@pytest.fixture(scope="module")
-def demonstrations(tmp_path_factory):
-    out = tmp_path_factory.mktemp("insertion")
+def test_demonstrations_carry_their_spaces(tmp_path):
     config = DemoConfig(("INSERTION",), episodes=4, camera=SMALL, frame_stride=10, workers=1, tail=5)
     assert (config.camera.name, config.horizon) == ("front", 120)
-    record(config, out)
-    return DemoDataset.open(out)
-
-
-def test_demonstrations_carry_their_spaces(demonstrations):
+    record(config, tmp_path)
+    demonstrations = DemoDataset.open(tmp_path)
     manifest = demonstrations.manifest
     assert (manifest.actions, manifest.observation) == (SPEC.actions, SPEC.observation)
     assert set(manifest.versions) == {"mujoco", "numpy", "python"}

@@ -15,6 +15,7 @@ import pytest
 from command import kerv, refusal, told
 from examples.tiny_openvla import TINY, write_checkpoint
 from loaded import of_target
+from test_openvla import edited as changed
 from test_openvla import imported
 
 from kerv_cli.base import registry
@@ -130,17 +131,6 @@ def test_a_recording_cannot_be_rolled_out(results):
     assert "kerv serve policy.target=" in refused, "what can be done with it"
 
 
-def without_positions(results: Path, tmp_path: Path) -> Path:
-    """The LeRobot dataset as a robot records it: no privileged state."""
-    copy = edited(results, tmp_path)
-    info = json.loads((copy / "meta/info.json").read_text())
-    del info["features"]["observation.environment_state"]
-    (copy / "meta/info.json").write_text(json.dumps(info))
-    data = copy / "data/chunk-000/file-000.parquet"
-    pq.write_table(pq.read_table(data).drop_columns(["observation.environment_state"]), data)
-    return copy
-
-
 def trained(results: Path, *words: str) -> str:
     """Train a policy for two steps, and return what the command printed."""
     short = ["train.steps=2", "train.batch=2", "train.validate_every=2", "train.held_out=0.5", f"results={results}"]
@@ -150,7 +140,12 @@ def trained(results: Path, *words: str) -> str:
 
 @pytest.mark.usefixtures("quick_training")
 def test_a_policy_of_data_without_object_positions_acts_in_their_world(results, tmp_path):
-    source = without_positions(results, tmp_path)
+    source = edited(results, tmp_path)
+    info = json.loads((source / "meta/info.json").read_text())
+    del info["features"]["observation.environment_state"]  # as a robot records it: no privileged state
+    (source / "meta/info.json").write_text(json.dumps(info))
+    data = source / "data/chunk-000/file-000.parquet"
+    pq.write_table(pq.read_table(data).drop_columns(["observation.environment_state"]), data)
     common = [f"results={tmp_path}", f"world.camera.size={SIZE}"]
     read = ["demos", "import", f"source={source}", "environment=insertion", "name=bare"]
     kerv(*read, f"results={tmp_path}")
@@ -172,10 +167,7 @@ def test_a_policy_of_a_recording_without_object_positions_decodes(results):
 
 
 def edited(results: Path, tmp_path: Path, **changes: Any) -> Path:
-    copy = Path(shutil.copytree(results / "lerobot/pegs", tmp_path / "copy"))
-    info = json.loads((copy / "meta/info.json").read_text())
-    (copy / "meta/info.json").write_text(json.dumps({**info, **changes}))
-    return copy
+    return changed(results / "lerobot/pegs", tmp_path, "meta/info.json", **changes)
 
 
 @pytest.mark.parametrize(
@@ -257,7 +249,7 @@ def test_a_dataset_that_is_too_large_is_refused_in_one_line(results, tmp_path, c
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 2 * 2**20  # kilobytes
 
 
-def test_episodes_may_be_in_any_order(results, tmp_path):
+def test_episodes_may_be_in_any_order_and_a_truncated_table_is_refused(results, tmp_path):
     source = edited(results, tmp_path)
     data = source / DATA.format(chunk_index=0, file_index=0)
     pq.write_table(pq.read_table(data).sort_by([("episode_index", "descending")]), data)
@@ -267,6 +259,8 @@ def test_episodes_may_be_in_any_order(results, tmp_path):
         ours, theirs = before.load(index), after.load(index)
         assert ours.steps == theirs.steps
         assert {tuple(step) for step in ours.states} == {tuple(step) for step in theirs.states}
+    data.write_bytes(data.read_bytes()[:-2000])
+    assert data.name in refusal("demos", "import", f"source={source}", "name=cut", f"results={tmp_path}", code=1)
 
 
 def test_imports_whose_names_differ_in_a_dash_are_environments_of_their_own(results, tmp_path, monkeypatch):
@@ -288,13 +282,6 @@ def test_imports_whose_names_differ_in_a_dash_are_environments_of_their_own(resu
         assert len(specs()[name].tasks) == tasks
     DemoDataset.open(tmp_path / "artifacts/demos/my-data")
     assert [len(specs()[name].tasks) for name in ("my-data", "my_data")] == [2, 1]
-
-
-def test_a_truncated_table_is_refused(results, tmp_path):
-    source = edited(results, tmp_path)
-    data = source / "data/chunk-000/file-000.parquet"
-    data.write_bytes(data.read_bytes()[:-2000])
-    assert data.name in refusal("demos", "import", f"source={source}", f"results={tmp_path}", code=1)
 
 
 def test_a_dataset_with_videos_is_read(results, tmp_path):
@@ -347,12 +334,6 @@ def spaces(policies, tmp_path_factory):
     shutil.copytree(policies, spaces)
     record(DemoConfig(("insert-peg",), 4, frame_stride=16, workers=1), spaces / "artifacts/demos/pegs")
     return spaces
-
-
-def test_a_rollout_refuses_a_target_of_other_actions(spaces):
-    words = ["rollout", "policy=state", TARGET, "episodes=1", "record=0", f"results={spaces}", "task=insert-peg"]
-    said = "target 'nano-state' has an action space with names dx, dy, dz, gripper, environment insertion one with"
-    assert said in refusal(*words)
 
 
 @pytest.mark.parametrize(

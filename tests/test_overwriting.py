@@ -35,8 +35,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 def artifacts(results: Path) -> dict[str, bytes]:
-    shown = {name: data for name, data in content(results / "artifacts").items() if not name.endswith(".lock")}
-    return shown
+    return {name: data for name, data in content(results / "artifacts").items() if not name.endswith(".lock")}
 
 
 @pytest.mark.parametrize(
@@ -240,8 +239,6 @@ def test_a_calibration_measures_in_the_format_and_on_the_device_that_it_records(
 
 
 def test_a_recording_by_a_policy_honours_the_device_and_the_format(results, monkeypatch):
-    import torch
-
     from kerv_cli.base.config import compose
     from kerv_cli.training.demonstrations import plan_demos, recording_of
     from kerv_cli.training.settings import DemosSettings

@@ -107,8 +107,8 @@ def test_blocks_go_by_task_and_seeds():
     assert [(b.task, len(b.seeds)) for b in blocks[:4]] == [*(("reach-v3", n) for n in (3, 3, 1)), ("push-v3", 3)]
     assert [b.seeds[0] for b in blocks[:3]] == [100_000, 100_003, 100_006]
     assert all([setting.label for setting in block.settings] == ["ar", "b"] for block in blocks)
-    assert blocks[0].name == "reach-v3 100000-100002"
-    assert blocks[-1].name == "push-v3 100006"
+    assert blocks[0].title.startswith("reach-v3 100000-100002: ")
+    assert blocks[-1].title.startswith("push-v3 100006: ")
 
 
 def test_settings_take_turns_seed_by_seed_in_a_drawn_order():

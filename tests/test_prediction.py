@@ -45,10 +45,6 @@ def compensation(**values: Any) -> Compensation:
     return Compensation(CompensateSettings(**values), HOLD)
 
 
-def follower_of(*actions: list[float]) -> Follower:
-    return followed(Follower(SPACE), *actions)
-
-
 def followed(follower: Any, *actions: list[float]) -> Any:
     for action in actions:
         follower.observe(SPACE.unnormalise(np.array(action)), np.zeros(3))
@@ -56,7 +52,7 @@ def followed(follower: Any, *actions: list[float]) -> Any:
 
 
 ACTIONS = [0.1, 0.2, 0.3, 1.0], [0.2, 0.1, 0.3, 1.0]
-PAST = follower_of(*ACTIONS)
+PAST = followed(Follower(SPACE), *ACTIONS)
 
 
 def chunk_with(episode: Follower) -> Chunk:
@@ -246,13 +242,12 @@ def test_without_a_gripper_to_hold_the_drafts_is_taken(wrong):
 
 # --- kinematics
 
-DOFS = 4
 HELD = (False, False, False, True)
 
 
 def noise_of(q: float, r: float) -> Noise:
     """The same for all DoFs."""
-    return Noise((q,) * DOFS, (r,) * DOFS)
+    return Noise((q,) * D, (r,) * D)
 
 
 NOISE = {"kalman": noise_of(5.0, 0.5)}
@@ -290,14 +285,14 @@ log_scale = st.floats(-4, 3).map(lambda x: 10.0**x)
 
 
 @given(
-    arrays(np.float64, st.tuples(st.integers(2, 14), st.just(DOFS)), elements=st.floats(-1, 1)),
+    arrays(np.float64, st.tuples(st.integers(2, 14), st.just(D)), elements=st.floats(-1, 1)),
     log_scale,
     log_scale,
     st.integers(1, HORIZON),
 )
 def test_a_filter_goes_on_along_the_newest_actions_most_probable_path_clipped(history, q, r, steps):
     ahead = PREDICTORS["kalman"](np.array(HELD), noise_of(q, r), minimum=2).predict(history, steps)
-    for dof in range(DOFS - 1):
+    for dof in range(D - 1):
         expected = most_probable_path(history[-WINDOW:, dof], q, r, steps)
         np.testing.assert_allclose(ahead[:, dof], np.clip(expected, -1, 1), rtol=1e-6, atol=1e-6)
 
@@ -314,30 +309,18 @@ def test_hold_and_linear():
 
 @given(
     st.sampled_from(tuple(PREDICTORS)),
-    arrays(np.float64, (7, DOFS), elements=st.floats(-1, 1)),
-    st.tuples(*[st.booleans()] * DOFS),
+    arrays(np.float64, (7, D), elements=st.floats(-1, 1)),
+    st.tuples(*[st.booleans()] * D),
     st.integers(0, HORIZON),
 )
 def test_predictions_are_bounded_and_held_dofs_keep_their_last_value(kind, history, held, steps):
     ahead = predictor(kind, held).predict(history, steps)
-    assert ahead.shape == (steps, DOFS)
+    assert ahead.shape == (steps, D)
     assert (np.abs(ahead) <= 1).all()
     assert (ahead[:, held] == history[-1, held]).all()
     moving = np.logical_not(held)
-    free = predictor(kind, (False,) * DOFS).predict(history, steps)
+    free = predictor(kind, (False,) * D).predict(history, steps)
     assert (ahead[:, moving] == free[:, moving]).all()
-
-
-def test_the_history_keeps_the_newest():
-    past, one = [[i / 20] * DOFS for i in range(WINDOW + 2)], np.full((1, DOFS), 0.9)
-    follower = follower_of(*past)
-    newest = np.array(past[-WINDOW:])
-    np.testing.assert_allclose(follower.history(), newest)
-    extended = follower.history(np.repeat(one, 2, 0))  # known steps of the chunk take the newest places
-    np.testing.assert_allclose(extended, [*newest[2:], *one, *one])
-    np.testing.assert_allclose(follower.history(), newest)
-    assert follower_of().history().shape == (0, DOFS)
-    np.testing.assert_allclose(follower_of().history(one), one)
 
 
 @pytest.mark.parametrize(("kind", "least"), [("hold", 1), ("linear", 2), ("kalman", 4), ("walk", 4)])

@@ -23,7 +23,6 @@ from kerv_cli.episodes.resolve import resolve, resolve_rollout
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.runs import run_rows
 from kerv_cli.report.plots import read_log
-from kerv_cli.training.preparation import needs
 from kerv_cli.worlds import resolve_tasks
 
 TASK = "reach-v3"
@@ -108,10 +107,6 @@ def test_prepare_makes_what_is_missing_and_skips_what_is_there(results):
     assert told("prepare", MINE, "--plan").count("there") == 4
     shutil.rmtree(results / "artifacts/datastore/mine")
     assert "missing" in told("prepare", MINE, "--plan")
-    path = results / "artifacts/drafter/mine/drafter.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"target": "0" * 64}))
-    assert "type replace=true, or name another" in told("prepare", MINE, "--plan", code=1)
-    assert "of other artifacts" in told("prepare", MINE, "replace=true", "--plan")
 
 
 @pytest.mark.parametrize(
@@ -215,10 +210,6 @@ def test_a_target_that_decodes_in_parallel_takes_no_drafts(results, command):
     described["settings"]["parallel"] = True
     path.write_text(json.dumps(described))
     assert "decodes all tokens at once" in told(*command.split(), MINE, "--plan", code=2)
-
-
-def test_a_method_needs_no_more_than_its_parts_read():
-    assert needs(("one_pass",)) == ("early",)
 
 
 @pytest.mark.usefixtures("quick_training")

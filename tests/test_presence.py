@@ -52,7 +52,6 @@ def test_weights_that_are_replaced_while_a_sweep_runs_fail_the_setting(policies,
 
 MAKES = """
 import sys
-import time
 from kerv_cli.base.errors import UsageError
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import Run

@@ -7,7 +7,7 @@ from command import process, told
 from conftest import refused
 
 from kerv_cli.base import registry
-from kerv_cli.base.errors import UnknownName, UsageError
+from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import check_settings
 from kerv_cli.base.registry import (
     METHOD_KINDS,
@@ -84,14 +84,6 @@ def test_a_name_belongs_to_one_piece_of_code(shelf):
     assert list(parts("proposer"))[-1] == "mine"  # in the order of registration
 
 
-def test_an_unknown_name_lists_the_near_ones():
-    with pytest.raises(UnknownName, match="unknown acceptance 'relaxd': did you mean relaxed"):
-        find("acceptance", "relaxd")
-    with pytest.raises(UnknownName, match=r"unknown acceptance\.kind 'x': known: strict, relaxed, sequence, hybrid"):
-        find("acceptance", "x", "acceptance.kind")
-    assert parts("nothing of the kind") == {}
-
-
 @pytest.mark.parametrize(("kind", "name"), EVERY)
 def test_what_a_part_names_is_there(kind, name):
     part = find(kind, name)
@@ -103,11 +95,6 @@ def test_what_a_part_names_is_there(kind, name):
         assert isinstance(part.needed(chosen), tuple)
         assert set(part.needed(chosen)) <= set(parts("artifact"))
         check_settings(chosen, kind)  # defaults are in range
-
-
-def test_every_proposer_says_when_it_can_draft():
-    assert {part.when for part in ProposerPart.every().values()} == {PREFILL, STATES}
-    assert {part.when for part in ProposerPart.every().values() if part.chains} == {PREFILL}
 
 
 @pytest.mark.usefixtures("shelf")

@@ -13,7 +13,8 @@ from command import kerv, refusal, told
 from studies_synthetic import episode, still_episode, swept, threshold_study
 from test_board import client_of
 
-from kerv_cli.episodes.cost import Profile, prices, work_of_record
+from kerv_cli.base.paths import shipped_dir
+from kerv_cli.episodes.cost import FORWARDS, Profile, prices, read_profile, source_costs, work_of_record
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import Study
 from kerv_cli.report.profiles import NamedProfile, open_profiles
@@ -50,12 +51,12 @@ def data(results):
     return load_study(Study(opened(results), "threshold"))
 
 
-def profile_file(results: Path, name: str = "there", without: str = "", **changes: Any) -> None:
+def profile_file(results: Path, name: str = "there", without: str = "", device: str = "GPU", **changes: Any) -> None:
     profile = PROFILE.as_dict() | changes
     profile["phases"] = {kind: costs for kind, costs in profile["phases"].items() if kind != without}
     folder = results / "bench"
     folder.mkdir(exist_ok=True)
-    (folder / f"{name}.json").write_text(json.dumps({**ABOUT, "profile": profile}))
+    (folder / f"{name}.json").write_text(json.dumps({**ABOUT, "device_name": device, "profile": profile}))
 
 
 def table_of(priced: Sequence[Priced]) -> pd.DataFrame:
@@ -96,9 +97,7 @@ def report(results: Path, *words: str) -> str:
 
 def test_a_report_prices_the_study_on_several_machines(results):
     profile_file(results)
-    profile_file(results, "elsewhere")
-    document = json.loads((results / "bench/elsewhere.json").read_text())
-    (results / "bench/elsewhere.json").write_text(json.dumps({**document, "device_name": "CPU"}))
+    profile_file(results, "elsewhere", device="CPU")
     assert "vla-150m, GPU: per episode" in report(results, "on=there,elsewhere", "loss=99")
     table = pd.read_csv(results / "report/tables/threshold_on.csv")
     assert sorted(set(table["on"])) == ["elsewhere", "there"]
@@ -144,17 +143,16 @@ def test_a_study_is_also_priced_by_the_profile_of_its_own_machine(tmp_path):
     device = data.episodes["device_name"].iloc[0]
     assert priced_on(data) == set()
     profile_file(tmp_path)
-    own = tmp_path / "bench/mt10-vision-float32.json"
-    for name, machines in (("another one", {"there"}), (device, {"there", "mt10-vision-float32"})):
-        profile_file(tmp_path, own.stem)
-        own.write_text(json.dumps({**json.loads(own.read_text()), "device_name": name}))
+    own = "mt10-vision-float32"
+    for name, machines in (("another one", {"there"}), (device, {"there", own})):
+        profile_file(tmp_path, own, device=name)
         assert priced_on(data) == machines
     with client_of(tmp_path) as client:
         page = client.get("/studies/threshold/tables").text
     assert f"vla-150m, {device}: per episode" in page
     assert f"measured, {device}: per episode" in page
     assert "GPU: per episode" not in page, "the board prices no other machine, which would take time"
-    profile_file(tmp_path, own.stem, without="feed")
+    profile_file(tmp_path, own, without="feed", device=device)
     assert priced_on(data) == {"there"}, "a profile that lacks a cost is left out"
 
 
@@ -197,9 +195,6 @@ def test_what_is_not_there_is_refused(results):
 
 
 def test_shipped_profiles_can_price_what_ships(tmp_path):
-    from kerv_cli.base.paths import shipped_dir
-    from kerv_cli.episodes.cost import FORWARDS, read_profile, source_costs
-
     shipped = sorted((shipped_dir().parent / "bench").glob("*.json"))
     for path in shipped:
         profile = read_profile(path)

@@ -39,10 +39,6 @@ def column(path: Path, entity: str, ending: str) -> list[Any]:
     return values
 
 
-def starts(path: Path, entity: str) -> list[int]:
-    return [step for batch in batches(path, entity) for step in batch["step"].to_pylist()]
-
-
 def named(path: Path, entity: str) -> list[str]:
     """Names of an entity's series."""
     for chunk in RrdReader(path).stream():
@@ -108,7 +104,8 @@ def test_values_survive_to_the_last_digit(tmp_path):
     assert np.array_equal(positions[:, 0], record.path)
     forwards = [row[0] for row in column(path, "/decode/forwards", "scalars")]
     assert forwards == [d.forwards for d in record.decodes]
-    assert tuple(starts(path, "/decode/forwards")) == record.decode_steps
+    starts = [step for batch in batches(path, "/decode/forwards") for step in batch["step"].to_pylist()]
+    assert tuple(starts) == record.decode_steps
     total = [row[0] for row in column(path, "/decode/phases", "scalars")]
     assert total == pytest.approx([1000 * d.seconds for d in record.decodes])
     first = next(r for r in record.decodes[0].rounds if r.drafted)

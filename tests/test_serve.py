@@ -173,11 +173,14 @@ def test_whoever_leaves_in_mid_message_leaves_the_server_running(policy):
         assert Client(port).infer(seen(1))["actions"].shape == (4, 4)
 
 
-def test_one_client_at_a_time(policy):
+def test_one_client_at_a_time_and_health_is_answered_without_a_seat(policy):
     with serving(policy) as (port, _):
         first = Client(port)
         with pytest.raises(ConnectionClosed, match="another client"):
             Client(port)
+        for path in ("healthz", "health"):
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/{path}", timeout=5) as answer:
+                assert answer.read() == b"OK\n"
         assert first.infer(seen(2))["actions"].shape == (4, 4)
         first.connection.close()
         until(lambda: _accepted(port))
@@ -359,12 +362,3 @@ def test_a_client_that_breaks_off_is_a_line_of_the_log(policy, capfd):
             lost.close()
         until(lambda: _accepted(port))
     assert "Traceback" not in capfd.readouterr().err
-
-
-def test_health_is_answered_without_a_seat(policy):
-    with serving(policy) as (port, _):
-        first = Client(port)
-        for path in ("healthz", "health"):
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/{path}", timeout=5) as answer:
-                assert answer.read() == b"OK\n"
-        first.connection.close()

@@ -172,19 +172,6 @@ def test_tables_and_figures_are_filled_and_stay_as_they_are_then(figures):
     assert figures.filled(filled) == filled
 
 
-@pytest.mark.parametrize(
-    ("page", "says"),
-    [
-        ("<!-- table none: setting -->\n<!-- /table -->", "no table none.csv"),
-        ("<!-- table small: colour -->\n<!-- /table -->", "no column colour"),
-        ("<!-- figure small two_pass speedup --><!-- /figure -->", "0 settings two_pass"),
-    ],
-)
-def test_a_wrong_reference_is_named(figures, page, says):
-    with pytest.raises(figures.BadReference, match=says):
-        figures.filled(page)
-
-
 def test_a_page_that_differs_fails_the_check_and_is_mended_without(figures, tmp_path, capsys):
     page = tmp_path / "page.md"
     page.write_text("<!-- figure small one_pass success -->7/10<!-- /figure -->", encoding="utf-8")
@@ -194,17 +181,6 @@ def test_a_page_that_differs_fails_the_check_and_is_mended_without(figures, tmp_
     assert figures.main([str(page)]) == 0
     assert "8/10" in page.read_text(encoding="utf-8")
     assert figures.main(["--check", str(page)]) == 0
-
-
-def test_tables_are_published_where_they_are_committed(figures, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(figures, "WRITTEN", tmp_path / "report")
-    (tmp_path / "report").mkdir()
-    for name in ("new.csv", "new_on.csv", "newer.csv"):
-        (tmp_path / "report" / name).write_text("label\nar\n")
-    assert figures.main(["publish", "new"]) == 0
-    assert {path.name for path in tmp_path.glob("new*.csv")} == {"new.csv", "new_on.csv"}
-    assert figures.main(["publish", "other"]) == 1
-    assert "kerv report study=other" in capsys.readouterr().err
 
 
 def test_the_first_page_and_the_results_stay_short():

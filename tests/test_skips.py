@@ -129,7 +129,7 @@ def test_always_skip_executes_the_sources_tokens_without_a_forward():
         assert record.tokens == tuple(source.drafted) != tuple(plain_greedy(target, target.encode(SHOWN)))
         assert (record.forwards, record.skipped, record.mode) == (0, True, "skip")
         assert [(r.mode, r.proposer) for r in record.rounds] == [("skip", "near")]
-        assert record.unverified == record.actions.size == len(record.tokens)
+        assert record.unverified_among(0, len(record.actions)) == record.actions.size == len(record.tokens)
 
 
 def test_always_skip_without_a_history_lets_the_target_decode():
@@ -139,11 +139,11 @@ def test_always_skip_without_a_history_lets_the_target_decode():
     decoder.reset("t", 0, HOME)
     first = decoder.decode(SHOWN)
     assert first.tokens == tuple(plain_greedy(target, target.encode(SHOWN)))
-    assert (first.forwards, first.skipped, first.unverified) == (len(first.tokens), False, 0)
+    assert (first.forwards, first.skipped, first.unverified_among(0, 2)) == (len(first.tokens), False, 0)
     decoder.observe(first.actions[0], HOME)
     second = decoder.decode(SHOWN)
     assert second.tokens == 2 * first.tokens[:7]
-    assert (second.forwards, second.skipped, second.unverified) == (0, True, 14)
+    assert (second.forwards, second.skipped, second.unverified_among(0, 2)) == (0, True, 14)
 
 
 # --- skip levels through a sweep

@@ -1,10 +1,8 @@
-"""Action spaces: round trips of tokens, groups, statistics; names, instructions and suites of the tasks."""
+"""Action spaces: round trips of tokens, statistics, codes; names, instructions and suites of the tasks."""
 
 import json
-import math
 import re
-from dataclasses import asdict, dataclass, field, replace
-from typing import Literal
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -15,10 +13,8 @@ from hypothesis import strategies as st
 
 from kerv_cli.base.codes import FastCode
 from kerv_cli.base.errors import CheckpointError, UnknownName, UsageError
-from kerv_cli.base.limits import number
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace
-from kerv_cli.targets.compact.features import PAD, UNKNOWN, WordTokenizer
 from kerv_cli.worlds import resolve_tasks, spec_of, specs, task_names
 from kerv_cli.worlds.metaworld.spec import SPEC
 from kerv_cli.worlds.metaworld.tasks import SUITES, TASKS
@@ -59,15 +55,6 @@ def test_statistics_are_the_percentiles_and_a_still_dof_stays_finite():
     assert back[:, 3] == pytest.approx(0.25, abs=WIDTH)
 
 
-def test_groups_and_strict_dofs_follow_from_the_space():
-    assert SPACE.bounds == ((0, 3), (0, 3), (0, 3), (3, 4))
-    assert SPACE.is_strict.tolist() == [False, False, False, True]
-    seven = INSERTION.actions
-    assert seven.dofs == 7
-    assert [seven.names[dof] for dof in np.flatnonzero(seven.is_strict)] == ["gripper"]
-    assert np.flatnonzero(seven.strict_tokens(14)).tolist() == [6, 13]
-
-
 def test_a_space_survives_its_json_and_a_damaged_one_gets_one_line():
     for space in (SPEC.actions, INSERTION.actions):
         assert read(ActionSpace, json.loads(json.dumps(space.as_dict())), "a space") == space
@@ -86,45 +73,6 @@ def test_a_space_survives_its_json_and_a_damaged_one_gets_one_line():
             read(ActionSpace, value, "an action space")
 
 
-@dataclass(frozen=True)
-class Inner:
-    share: float
-    note: str | None = None
-
-
-@dataclass(frozen=True)
-class Outer:
-    kind: Literal["outer"]
-    pair: tuple[int, float]
-    every: tuple[Inner, ...] = ()
-    by_name: dict[str, list[float]] = field(default_factory=dict)
-    count: int = number(1, 1, 9)
-
-
-def test_a_description_is_converted_field_by_field():
-    value = {"kind": "outer", "pair": [1, 2], "every": [{"share": 1, "note": None}], "by_name": {"a": [1, 0.5]}}
-    whole = Outer("outer", (1, 2.0), (Inner(1.0),), {"a": [1.0, 0.5]})
-    assert read(Outer, value, "it") == whole
-    assert read(Outer, {**value, "more": 1}, "it", tolerant=True) == whole
-
-
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"kind": "inner"}, "kind: 'inner' is no"),
-        ({"pair": [True, 1.0]}, "pair.0: 'True' is no int"),
-        ({"pair": [1, math.inf]}, "pair.1: inf is not finite"),
-        ({"every": [{}]}, "every.0.share: field required"),
-        ({"every": [{"share": 1.0, "more": 1}]}, "every.0.more: unknown field"),
-        ({"by_name": {"a": [math.nan]}}, "by_name.a.0: nan is not finite"),
-        ({"count": 10}, "count=10: from 1 to 9"),
-    ],
-)
-def test_a_wrong_field_is_named_with_the_file(changes, says):
-    with refused(f"FILE is damaged: {says}", error=CheckpointError):
-        read(Outer, {"kind": "outer", "pair": [1, 2.0]} | changes, "FILE")
-
-
 def test_what_was_made_for_other_actions_is_refused_by_the_first_difference():
     fitted = replace(SPACE, low=(-0.5,) * 4)
     fitted.check_same(SPACE, "the target", "the environment")
@@ -137,16 +85,6 @@ def test_what_was_made_for_other_actions_is_refused_by_the_first_difference():
     for name, other in others.items():
         with pytest.raises(CheckpointError, match=f"an action space with {name} "):
             SPACE.check_same(other, "the target", "the drafter", statistics=True)
-
-
-def test_words_keep_their_ids_and_a_long_sentence_is_refused():
-    words = WordTokenizer.build(["open the drawer", "close the door"])
-    ids = words.encode("Open the window", 5)
-    assert ids[2] == UNKNOWN
-    assert ids[3:] == [PAD, PAD]
-    assert len({*words.encode("open the drawer close door", 5)}) == 5
-    with pytest.raises(UsageError, match="5 words, the policy takes 4"):
-        words.encode("open the drawer close door", 4)
 
 
 # --- sim tasks
@@ -192,13 +130,6 @@ def test_every_spec_fits_together():
         own = [task.instruction for name, task in spec.tasks.items() if "_" not in name]  # LIBERO-PRO repeats some
         assert len(set(own)) == len(own)
         assert spec.observation.state >= len(spec.observation.proprioception) > 3
-
-
-@pytest.mark.parametrize(("seeds", "purpose"), [([100_000, 99_999], "evaluation"), ([-1], "training")])
-def test_seeds_of_one_purpose_are_refused_for_another(seeds, purpose):
-    SPEC.seeds.check([100_000, 2_000_000], "evaluation", "seed")
-    with pytest.raises(UsageError, match=f"seed {seeds[-1]} "):
-        SPEC.seeds.check(seeds, purpose, "demos")
 
 
 @settings(max_examples=60)

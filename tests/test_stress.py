@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -48,17 +49,9 @@ def metaworld():
         yield world
 
 
-@dataclasses.dataclass
-class Episode:
-    """What a policy meets that always executes the same actions."""
-
-    states: np.ndarray  # (steps + 1, s)
-    images: np.ndarray  # (n, size, size, 3)
-    frames: np.ndarray  # the same, as recorded
-    start: np.ndarray
-
-
-def play(world: MujocoWorld, kind: str, level: int, seed: int = SEED, steps: int = STEPS) -> Episode:
+def play(world: MujocoWorld, kind: str, level: int, seed: int = SEED, steps: int = STEPS) -> SimpleNamespace:
+    """What a policy meets that always executes the same actions: states (steps + 1, s), images as it sees them and as
+    they are recorded (n, size, size, 3), and the initial state."""
     world.stress = stressing.build(StressSettings(kind, level))
     space, camera = world.spec.actions, world.spec.cameras[0]
     actions = np.random.default_rng(1).uniform(space.low, space.high, (steps, space.dofs)) * 0.5
@@ -68,7 +61,8 @@ def play(world: MujocoWorld, kind: str, level: int, seed: int = SEED, steps: int
             images.append(world.observe([camera]).images[camera])
             frames.append(world.frame())
         states.append(world.step(action).state)
-    return Episode(np.array(states), np.array(images), np.array(frames), world.initial_state)
+    seen = {"states": states, "images": images, "frames": frames, "start": world.initial_state}
+    return SimpleNamespace(**{name: np.array(values) for name, values in seen.items()})
 
 
 def model_of(world: MujocoWorld) -> dict[str, np.ndarray]:

@@ -1,7 +1,6 @@
 """Intervals and tests against closed forms, slower references and simulated coverage."""
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -54,17 +53,10 @@ def test_tasks_are_the_clusters_where_each_has_one_block():
     assert mixed.low < mixed.value < mixed.high
 
 
-@pytest.fixture(scope="module")
-def coverage():
-    """`coverage` of scripts/coverage.py: tasks, blocks per task, studies -> interval -> share that holds the truth."""
-    found: Callable[[int, int, int], dict[str, float]] = module_of(SCRIPT).coverage
-    return found
-
-
 @pytest.mark.parametrize("blocks", [1, 4])
-def test_every_interval_of_a_study_of_ten_tasks_covers_the_truth(coverage, blocks):
+def test_every_interval_of_a_study_of_ten_tasks_covers_the_truth(blocks):
     """At a nominal 95 %: no less, up to the 150 simulated studies' own error; some are wider than necessary."""
-    for name, inside in coverage(10, blocks, 150).items():
+    for name, inside in module_of(SCRIPT).coverage(10, blocks, 150).items():
         assert inside >= 0.95 - 2.6 * math.sqrt(0.05 * 0.95 / 150), name
 
 

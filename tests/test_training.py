@@ -4,8 +4,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,8 +11,7 @@ import numpy as np
 import pytest
 import torch
 from command import kerv, refusal
-from conftest import refused, until
-from safetensors.torch import load_file
+from conftest import refused
 from torch import nn
 
 from kerv_cli.base import files
@@ -28,7 +25,7 @@ from kerv_cli.targets.checkpoint import load_target, save_tensors
 from kerv_cli.targets.compact.target import CompactTarget, save_target
 from kerv_cli.targets.losses import soft_labels, token_loss
 from kerv_cli.targets.settings import TargetSettings
-from kerv_cli.training.fit import Metrics, Progress, Save, batches, fit, read_state
+from kerv_cli.training.fit import Metrics, Progress, Save, batches, fit
 from kerv_cli.training.settings import TrainSettings
 from kerv_cli.training.target import Imitation, Samples, lit, vocabulary, waypoints_of
 from kerv_cli.worlds.demos.files import DemoEpisode
@@ -228,52 +225,15 @@ def test_waypoints_are_where_the_gripper_changes_next_and_where_the_episode_ends
     assert three[:, :, 0].tolist() == [[4, 8, 9], [8, 9, 9], [9, 9, 9]]
 
 
-def train(results: Path, *arguments: str) -> str:
-    """What the command prints."""
-    done = kerv("train", *arguments, f"results={results}", "demos=few")
-    return done.stdout
-
-
-@pytest.mark.bits
-@pytest.mark.usefixtures("quick_training")
-def test_a_killed_training_run_goes_on_and_matches_the_uninterrupted_one(results):
-    settings = ["target=nano", "target.observation=state", "task=drawer-close"]
-    settings += ["train.batch=4", "train.validate_every=4", "train.steps=16"]
-    train(results, "target", "name=whole", *settings)
-    words = ["train", "target", "name=cut", *settings, f"results={results}", "demos=few"]
-    command = [sys.executable, "-W", "ignore", "-m", "kerv_cli", *words]
-    killed = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    folder = results / "artifacts/target/cut"
-    until((folder / RESUME).exists, 100)
-    os.kill(killed.pid, signal.SIGKILL)
-    killed.wait()
-    assert 4 <= read_state(folder / RESUME)["step"] <= 16
-    train(results, "target", "name=cut", *settings)
-    a, b = (load_file(results / f"artifacts/target/{n}/model.safetensors") for n in ("whole", "cut"))
-    assert a.keys() == b.keys()
-    assert all(torch.equal(a[k], b[k]) for k in a)
-
-
 @pytest.mark.usefixtures("quick_training")
 def test_a_run_learns_the_experts_own_path(results):
-    words = ["target=nano", "train=plain", "task=drawer-close", "train.batch=2", "train.steps=3"]
-    out = train(results, "target", "name=path", *words, "train.validate_every=3")
+    words = ["train", "target", "target=nano", "train=plain", "task=drawer-close", "train.batch=2", "train.steps=3"]
+    words += ["train.validate_every=3", "demos=few", f"results={results}"]
+    out = kerv(*words, "name=path", "train.scene_steps=1", "train.closed_loop=1", "world.horizon=4").stdout
+    assert "closed_loop_success" in out
     assert "waypoint_1_error_cm" in out
     assert "object_error_cm" not in out
-    out = train(results, "target", "name=none", *words, "train.validate_every=3", "train.scene_weight=0")
-    assert "waypoint" not in out
-
-
-@pytest.mark.usefixtures("quick_training")
-def test_vision_target_and_its_drafter_train_from_the_command_line(results):
-    settings = ["target=nano", "task=drawer-close", "train.batch=2", "train.steps=4", "train.scene_steps=1"]
-    settings += ["train.validate_every=2", "train.closed_loop=1", "world.horizon=4"]
-    assert "closed_loop_success" in train(results, "target", "name=seen", *settings)
-    drafter = ["train.steps=2", "train.batch=2", "train.validate_every=2", "drafter.samples=8"]
-    assert "acceptance_length_r9" in train(results, "drafter", "policy.target=seen", *drafter)
-    described = json.loads((results / "artifacts/drafter/seen/drafter.json").read_text())
-    target = json.loads((results / "artifacts/target/seen/target.json").read_text())
-    assert described["target"] == target["sha256"]
+    assert "waypoint" not in kerv(*words, "name=none", "train.scene_weight=0").stdout
 
 
 @pytest.mark.usefixtures("quick_training")

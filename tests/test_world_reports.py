@@ -6,11 +6,9 @@ from dataclasses import replace
 import pytest
 from studies_synthetic import episode, points_of, settings_of, study_of, swept
 
-from kerv_cli.base.config import compose
 from kerv_cli.engine.record import Delay
 from kerv_cli.episodes.identity import Setting, stress_of
-from kerv_cli.episodes.resolve import resolve
-from kerv_cli.episodes.settings import RolloutSettings, SweepSettings, TimingSettings
+from kerv_cli.episodes.settings import RolloutSettings, TimingSettings
 from kerv_cli.lab.work import RunEpisode
 from kerv_cli.report.plots import study_figures
 from kerv_cli.report.statistics import PairedCounts
@@ -44,20 +42,14 @@ def run_stressed(setting: Setting, task: str) -> RunEpisode:
 
 @pytest.fixture(scope="module")
 def stressed(tmp_path_factory):
-    """The results folder of a study of stressed worlds, and its data."""
-    folder = tmp_path_factory.mktemp("stress")
-    store, _ = swept(folder, study_of(stressed_settings(), TASKS, "stress", title="", axis=""), run_stressed)
-    return folder, load_study(store)
+    """The data of a study of stressed worlds."""
+    study = study_of(stressed_settings(), TASKS, "stress", title="", axis="")
+    return load_study(swept(tmp_path_factory.mktemp("stress"), study, run_stressed)[0])
 
 
-@pytest.fixture(scope="module")
-def stressed_results(stressed):
-    return stressed[1].results
-
-
-def test_a_stressed_setting_is_compared_with_the_baseline_under_the_same_stress(stressed, stressed_results):
-    rows = {row.label: row.columns() for row in stressed_results}
-    assert stressed[1].references["bold"] == "ar"
+def test_a_stressed_setting_is_compared_with_the_baseline_under_the_same_stress(stressed):
+    rows = {row.label: row.columns() for row in stressed.results}
+    assert stressed.references["bold"] == "ar"
     assert rows["bold, kind=push level=4"]["baseline"] == "ar, kind=push level=4"
     assert rows["bold, kind=push level=4"]["difference"] == 0.0
     assert rows["bold, kind=light level=4"]["difference"] == -0.5
@@ -66,8 +58,8 @@ def test_a_stressed_setting_is_compared_with_the_baseline_under_the_same_stress(
     assert (rows["ar"]["stress"], rows["ar"]["stress_level"]) == ("none", 0)
 
 
-def test_the_figure_has_a_panel_per_kind_and_a_line_per_method(stressed_results):
-    figures = study_figures(stressed_results, "")
+def test_the_figure_has_a_panel_per_kind_and_a_line_per_method(stressed):
+    figures = study_figures(stressed.results, "")
     assert list(figures) == ["line"]
     assert [panel.title for panel in figures["line"].concat] == ["push", "light"]
     light = points_of(figures["line"])[1]
@@ -77,14 +69,14 @@ def test_the_figure_has_a_panel_per_kind_and_a_line_per_method(stressed_results)
     }
 
 
-def test_the_verdict_says_who_falls_behind_where(stressed_results):
-    behind, is_shown, _ = verdict_of(stressed_results, 3.0)
+def test_the_verdict_says_who_falls_behind_where(stressed):
+    behind, is_shown, _ = verdict_of(stressed.results, 3.0)
     assert "less successful than the baseline: bold, kind=light level=4 (than ar, kind=light level=4). More" in behind
     assert not is_shown
-    kept = [row for row in stressed_results if (row.stress, row.stress_level) != ("light", 4)]
+    kept = [row for row in stressed.results if (row.stress, row.stress_level) != ("light", 4)]
     assert "less successful than the baseline: no setting. More successful: no setting" in verdict_of(kept, 3.0)[0]
     counts = PairedCounts(0, 2, 0, 38)
-    unsolved = [replace(row, measures=replace(row.measures, counts=counts)) for row in stressed_results]
+    unsolved = [replace(row, measures=replace(row.measures, counts=counts)) for row in stressed.results]
     assert "nothing is compared: ar; ar, kind=push level=1" in verdict_of(unsolved, 3.0)[0]
 
 
@@ -101,18 +93,6 @@ def test_with_two_clocks_the_verdict_names_the_label_of_each_baseline(tmp_path):
     results = load_study(swept(tmp_path, study, run)[0]).results
     said = verdict_of(results, 3.0).sentence
     assert "less successful than the baseline: bold, real (than mine, real). More successful: no setting" in said
-
-
-def test_the_shipped_study_has_every_method_under_every_kind_and_level():
-    resolved = resolve(["study=stress", "task=reach", "episodes=1"])
-    found = {(s.method, s.world.stress.kind, s.world.stress.level) for s in resolved.settings.values()}
-    methods = {method for method, _, _ in found}
-    kinds = {kind for _, kind, _ in found}
-    assert methods >= {"ar", "one_pass", "one_pass_streak", "early_unverified", "retrieval_unverified"}
-    assert len(kinds) == 4
-    assert len(found) == len(resolved.settings) == len(methods) * 13
-    study = compose("sweep", ["study=stress"], SweepSettings).study
-    assert study.baseline == "ar"
 
 
 # --- latency report
@@ -144,8 +124,7 @@ def run_delayed(delayed_setting: Setting, task: str) -> RunEpisode:
     return run
 
 
-@pytest.fixture(scope="module")
-def delayed(tmp_path_factory):
+def test_every_setting_is_compared_with_ar_at_its_latency(tmp_path):
     settings = {"ar waits": settings_of("ar")}
     for method, r in (("ar", 0), ("spec_vla", 9)):
         for ms in (0.0, 100.0):
@@ -154,12 +133,8 @@ def delayed(tmp_path_factory):
                     method, r, latency_ms=ms, delay_compensation=kind
                 )
     about = {"title": "Latency", "baseline": "ar waits", "axis": "rollout.latency_ms"}
-    folder = tmp_path_factory.mktemp("latency")
-    store, _ = swept(folder, study_of(settings, TASKS, "latency", **about), run_delayed)
-    return load_study(store).results
-
-
-def test_every_setting_is_compared_with_ar_at_its_latency(delayed):
+    store, _ = swept(tmp_path, study_of(settings, TASKS, "latency", **about), run_delayed)
+    delayed = load_study(store).results
     rows = {row.label: row for row in delayed}
     fast, own, ar = (rows[name] for name in ("spec_vla ms=100 none", "spec_vla ms=0 chunk", "ar ms=100 none"))
     assert fast.baseline == ar.label
