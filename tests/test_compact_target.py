@@ -268,7 +268,7 @@ def test_a_grown_target_whose_policy_changed_is_refused(policies, tmp_path):
 
 
 def shape_of(*overrides: str) -> TargetSettings:
-    words = ["target=nano", "target.observation=state", "target.chunk=2", *overrides]
+    words = ["target=nano", "target.observation=state", "target.chunk=4", *overrides]
     return compose("train_target", words, TrainTargetSettings).target
 
 
@@ -295,19 +295,21 @@ def in_parallel(policy: CompactTarget, prompt: torch.Tensor) -> list[int]:
 
 @pytest.mark.bits
 @torch.inference_mode()
+@pytest.mark.parametrize("chunk", [0, 1])
 @pytest.mark.parametrize("compiled", [False, True])
-def test_all_tokens_come_from_one_forward_in_which_they_see_each_other(compiled):
+def test_all_tokens_come_from_one_forward_in_which_they_see_each_other(compiled, chunk):
     policy = small("target.parallel=true")
     wanted = in_parallel(policy, policy.encode(observation(0)))
     if compiled:
         compile_parts(policy)
-    decoder = Decoder(policy, Parts(skip=ParallelPass(policy)))
+    decoder = Decoder(policy, Parts(skip=ParallelPass(policy)), chunk)
     decoder.reset("", 0, np.zeros(3))
     record = decoder.decode(observation(0))
-    assert list(record.tokens) == wanted
+    steps = chunk or policy.chunk
+    assert list(record.tokens) == wanted[: steps * policy.actions.dofs]
     assert len(set(wanted)) > 1
     unverified = record.unverified_among(0, len(record.actions))
-    assert (record.forwards, record.mode, unverified) == (1, "parallel", policy.chunk * policy.actions.dofs)
+    assert (record.forwards, record.mode, unverified) == (1, "parallel", steps * policy.actions.dofs)
     assert record.phases["prefill"] > 0
 
 
@@ -325,7 +327,7 @@ def test_it_continues_an_autoregressive_target_with_fresh_queries():
     plain = small()
     made = continued_target(shape_of("target.parallel=true"), plain, "")
     assert torch.equal(made.head.weight, plain.head.weight)
-    assert made.queries.shape == (8, plain.width)
+    assert made.queries.shape == (16, plain.width)
     described = type("D", (), {"settings": vars(plain.settings), "cameras": plain.cameras})()
     check_init(shape_of("target.parallel=true"), "", described, Path("x"))
     with pytest.raises(UsageError):

@@ -108,7 +108,8 @@ class Decoder(Follower):
         self.steps = chunk_steps(chunk, target.chunk)
         self.acceptance: DistanceRule = self.parts.acceptance or StrictRule(target.actions)
         self.threshold: Threshold = self.parts.threshold or Fixed(0)
-        size = target.actions.longest(self.steps)
+        # a parallel target always decodes as many tokens as it was trained for
+        size = target.actions.longest(target.chunk if getattr(target, "parallel", False) else self.steps)
         proposers = filter(None, (self.parts.prefill_draft, self.parts.proposer))
         nodes = max(size, *(proposer.nodes for proposer in proposers), 0)
         self.cache = target.new_cache(1, target.max_prompt + size + nodes + 1)
