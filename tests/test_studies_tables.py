@@ -434,11 +434,12 @@ def test_runs_with_seeds_of_their_own_are_the_only_cluster_of_a_ratio(tmp_path):
     assert reach == pytest.approx(4.3027 * logs.std(ddof=1) / np.sqrt(3), rel=1e-4)
 
 
-def test_a_run_that_only_filled_gaps_is_no_run_of_its_own(tmp_path):
-    tasks = ["reach-v3", "push-v3"]
-    for episodes, used in ((1, tasks), (2, tasks), (3, tasks[:1]), (3, tasks)):
-        store, _ = swept(tmp_path, threshold_study(used, episodes, ()))
-    assert {row.runs for row in load_study(store).results} == {1}
+def test_a_run_that_was_resumed_counts_once_and_a_later_setting_joins_all_runs(tmp_path):
+    tasks, runs = ["reach-v3", "push-v3"], []
+    for episodes, used, radii in ((1, tasks, ()), (2, tasks, ()), (3, tasks[:1], ()), (3, tasks, ()), (3, tasks, (3,))):
+        store, _ = swept(tmp_path, threshold_study(used, episodes, radii))
+        runs.append({row.runs for row in load_study(store).results})
+    assert runs == [{1}, {1}, {1}, {3}, {1}]
 
 
 def test_a_failed_episode_does_not_decide_the_speed_over_pairs_that_both_solved(tmp_path):

@@ -213,13 +213,19 @@ def load_study(study: Study, wanted: Sequence[Episode] | None = None) -> StudyDa
 
 
 def _with_new_seeds(episodes: pd.DataFrame) -> list[pd.DataFrame]:
-    """Return one table per run, the oldest first. Empty if runs share a seed, or if a run lacks a setting on a task."""
-    worlds = episodes[["run", "task", "seed"]].drop_duplicates()
-    cells = episodes[["run", "label", "task"]].drop_duplicates()
-    every = cells["label"].nunique() * cells["task"].nunique()
-    if worlds.duplicated(["task", "seed"]).any() or (cells.groupby("run").size() < every).any():
+    """Return one table per run, the oldest first. Empty if a run lacks a setting on a task.
+
+    Commands that ran episodes of the same seed count as one run, which was interrupted and resumed.
+    """
+    run, before = episodes["run"], None
+    while before is None or not run.equals(before):
+        before = run
+        for shared in ("seed", "run"):
+            run = run.groupby(episodes[shared]).transform("max")
+    cells = episodes.assign(run=run)[["run", "label", "task"]].drop_duplicates()
+    if (cells.groupby("run").size() < cells["label"].nunique() * cells["task"].nunique()).any():
         return []
-    return sorted((run for _, run in episodes.groupby("run")), key=lambda run: run["started"].min())
+    return sorted((part for _, part in episodes.groupby(run)), key=lambda part: part["started"].min())
 
 
 def _labelled(study: Study, episodes: pd.DataFrame) -> pd.DataFrame:
