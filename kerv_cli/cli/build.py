@@ -9,7 +9,7 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.files import owned, write_folder
 from kerv_cli.base.paths import check_free, find_target, new_target
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, database_of, make, print_figures
+from kerv_cli.cli.common import AsJson, ShowPlan, database_of, made, print_figures
 from kerv_cli.targets import TargetPart
 from kerv_cli.targets.settings import BuildTargetSettings
 from kerv_cli.training.settings import BuildDatastoreSettings
@@ -62,5 +62,6 @@ def datastore(settings: BuildDatastoreSettings, plan: ShowPlan = False, as_json:
     from kerv_cli.training.datastore import plan_datastore
 
     database = database_of(settings)
-    folder, store = make(plan_datastore(settings, database), database, plan, as_json)
+    with made(plan_datastore(settings, database), database, plan, as_json) as (folder, store):
+        pass
     print_figures("datastore", {"entries": len(store.vectors), "tasks": len(store.shards)}, folder, as_json)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import typer
 
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import ShowPlan, database_of, make, print_table
+from kerv_cli.cli.common import ShowPlan, database_of, made, print_table
 from kerv_cli.training.settings import CalibrateSettings
 
 
@@ -24,7 +24,8 @@ def constants(settings: CalibrateSettings, plan: ShowPlan = False) -> None:
     from kerv_cli.training.calibration import plan_calibration
 
     database = database_of(settings)
-    path, calibration, notes = make(plan_calibration(settings, database), database, plan)
+    with made(plan_calibration(settings, database), database, plan) as (path, calibration, notes):
+        pass
     levels_of = calibration.skip.tasks if calibration.skip else {}
     columns = ("task", "fitted on", "decodes", "K_S", *(("s_min", "would be skipped") if levels_of else ()))
     rows: list[tuple[object, ...]] = []

@@ -170,15 +170,16 @@ def database_of(settings: CommandSettings) -> Database:
     return opened(settings.results)
 
 
-def make(plan: Plan[T], database: Database, show: bool = False, as_json: bool = False) -> T:
-    """Carry out a plan, and return its result. With `show`, only print the plan and its duration, and end."""
+@contextmanager
+def made(plan: Plan[T], database: Database, show: bool = False, as_json: bool = False) -> Iterator[T]:
+    """Carry out a plan, and yield its result. With `show`, only print the plan and its duration, and end."""
     from kerv_cli.lab import runs
 
     if show:
         time = f"about {duration(plan.seconds())}" if plan.seconds else "time unknown"
         end_with_plan(f"{plan.text}, {time} ({plan.source})", as_json)
     with runs.making(database, plan.kind, plan.folder) as run:
-        return plan.make(lambda title: progress_bar(title, run))
+        yield plan.make(lambda title: progress_bar(title, run))
 
 
 @contextmanager

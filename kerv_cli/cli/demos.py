@@ -7,7 +7,7 @@ from pathlib import Path
 from kerv_cli.base.errors import Interrupted, UsageError
 from kerv_cli.base.paths import artifact
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import ShowPlan, database_of, make, print_table, progress_bar
+from kerv_cli.cli.common import ShowPlan, database_of, made, print_table, progress_bar
 from kerv_cli.training.settings import DemosSettings
 from kerv_cli.worlds.settings import DemosImportSettings
 
@@ -28,7 +28,8 @@ def demos(settings: DemosSettings, plan: ShowPlan = False) -> None:
 
     database, planned = database_of(settings), plan_demos(settings)
     try:
-        folder, manifest = make(planned, database, plan)
+        with made(planned, database, plan) as (folder, manifest):
+            pass
     except KeyboardInterrupt:
         kept = f"finished episodes are kept in {planned.path}, the same command goes on there"
         raise Interrupted(f"interrupted: {kept}") from None

@@ -8,7 +8,7 @@ from typing import Any
 import typer
 
 from kerv_cli.cli.command import command
-from kerv_cli.cli.common import AsJson, ShowPlan, database_of, end_with_json, make, print_figures
+from kerv_cli.cli.common import AsJson, ShowPlan, database_of, end_with_json, made, print_figures
 from kerv_cli.training.settings import TrainDrafterSettings, TrainTargetSettings
 
 
@@ -52,8 +52,8 @@ def _train(planned: Callable[..., Any], settings: Any, plan: bool, as_json: bool
     from kerv_cli.report.plots import save_curves
 
     database = database_of(settings)
-    folder, metrics = make(planned(settings, database), database, plan, as_json)
-    curves = save_curves(folder)
+    with made(planned(settings, database), database, plan, as_json) as (folder, metrics):
+        curves = save_curves(folder)
     if as_json:
         end_with_json({"folder": folder, "best": metrics, "curves": curves})
     print_figures("best checkpoint", metrics, folder)
