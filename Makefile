@@ -31,11 +31,11 @@ test-cpus: setup ## run the tests of equal bits and tokens under four kinds of C
 
 demo: setup ## README's table in small: six settings, one task, about three minutes
 	@echo "README's table in small: six settings decode the same three episodes in turn, about three minutes on one core"
-	@$(BIN)/kerv build target grow=60m policy.target=mt10-vision name=mt10-60m > /dev/null
+	@$(BIN)/kerv build target grow=60m policy.target=mt10-h1 name=mt10-60m > /dev/null
 	@$(BIN)/kerv sweep study=demo
 
-papers: setup ## train the policy of the papers' study by the commands of docs/training.md (90 minutes), then run a seed per task
-	@sed -n '/^## One action/,/^## /s/^kerv /$(subst /,\/,$(BIN))\/kerv /p' docs/training.md | sh -ex
+papers: setup ## run the papers' study, a seed per task, about half an hour
+	@$(BIN)/kerv build target grow=150m policy.target=mt10-h1 name=mt10-h1-150m > /dev/null
 	@$(BIN)/kerv sweep study=papers episodes=1 study.block=1
 
 torture: setup ## kill commands, break their disk, damage their files, at random (MINUTES=1)

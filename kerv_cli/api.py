@@ -213,7 +213,7 @@ class Policy:
 
 
 def load_policy(
-    target: str = "mt10-vision", *overrides: str, method: str = "one_pass", task: str = "", **settings: object
+    target: str = "mt10-h1", *overrides: str, method: str = "one_pass", task: str = "", **settings: object
 ) -> Policy:
     """Load a policy that turns observations into actions, and warm it up so that the first answer is not slower.
 

@@ -140,5 +140,5 @@ def main(name: str, repeats: int, folder: Path) -> bool:
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as scratch:
-        arguments = sys.argv[1] if len(sys.argv) > 1 else "mt10-vision", int(sys.argv[2]) if len(sys.argv) > 2 else 100
+        arguments = sys.argv[1] if len(sys.argv) > 1 else "mt10-h1", int(sys.argv[2]) if len(sys.argv) > 2 else 100
         print("the same tokens:", main(*arguments, Path(scratch)))

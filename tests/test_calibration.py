@@ -424,7 +424,7 @@ def test_the_command_prints_what_it_found(own):
 @pytest.mark.parametrize("where", ["calibration.json", "datastore/manifest.json"])
 def test_a_changed_digit_anywhere_in_a_file_that_decides_results_is_noticed(where, tmp_path):
     """Each number and each word of the shipped file, one at a time: also of its provenance, and of a manifest's key."""
-    shipped = shipped_dir() / "mt10-vision" / where
+    shipped = shipped_dir() / "mt10-h1" / where
     schema: Any = Calibration if where == "calibration.json" else Manifest
     value, path = json.loads(shipped.read_text()), tmp_path / "changed.json"
     assert "digest" in value

@@ -87,7 +87,7 @@ def test_features_of_any_space_depend_on_every_number(felt, places, seed):
 
 @pytest.mark.parametrize(
     ("name", "cameras", "prompt"),
-    [("mt10-vision", ("corner4",), 31), ("mt10-state", (), 15), ("mt50-plain", ("corner4+gripperPOV:75",), 23)],
+    [("mt10-h1", ("corner4",), 31), ("mt10-state", (), 15), ("mt50-plain", ("corner4+gripperPOV:75",), 23)],
 )
 def test_the_shipped_targets_load_with_metaworlds_spaces(name, cameras, prompt):
     target, description = load_target(shipped_dir() / name / "target")

@@ -127,7 +127,7 @@ def test_only_what_needs_no_states_can_be_chosen_before_the_prefill():
         ("policy=parallel method=parallel deviation_every=2", "no AR to differ from"),
         (
             "policy=vision world.camera.name=topview",
-            "camera.name=topview: mt10-vision sees corner4, leave it out",
+            "camera.name=topview: mt10-h1 sees corner4, leave it out",
         ),
     ],
 )

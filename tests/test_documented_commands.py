@@ -152,7 +152,7 @@ REMEDIES = {
     "rollout policy.target=mt10-150m": "kerv train target name=mt10-150m",
     "sweep study=papers_libero": "kerv sweep study=papers_libero --cfg",
     "rollout method=spec_vla policy.artifacts.drafter=few": (
-        "kerv train drafter policy.target=mt10-vision policy.artifacts.drafter=few"
+        "kerv train drafter policy.target=mt10-h1 policy.artifacts.drafter=few"
     ),
     "rollout nonsense=3": "kerv rollout --cfg",
     "report study=nosuch": "kerv runs list",

@@ -257,7 +257,7 @@ def test_reasons_name_what_changed(database, monkeypatch):
     assert reason(same) == ""
     assert reason(same, "push-v3") == "new task"
     assert reason(settings_of("spec_vla", 4)) == "threshold.r 3 → 4"
-    assert reason(same, weights={**IDENTITY, "target": "c" * 64}) == "weights of mt10-vision changed"
+    assert reason(same, weights={**IDENTITY, "target": "c" * 64}) == "weights of mt10-h1 changed"
     another = dataclasses.replace(same, policy=dataclasses.replace(same.policy, target="mine"))
     assert reason(another, weights={**IDENTITY, "target": "c" * 64}) == "new setting"  # nobody's weights changed
     idle = settings_of("spec_vla", 3)

@@ -277,7 +277,7 @@ def test_what_trains_is_not_packed_and_gets_its_gradients():
 
 
 def test_plain_decoders_in_numpy_and_c_give_the_shipped_policys_tokens(tmp_path):
-    assert plain_decoder.main("mt10-vision", 20, tmp_path)
+    assert plain_decoder.main("mt10-h1", 20, tmp_path)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -143,7 +143,7 @@ def test_a_study_is_also_priced_by_the_profile_of_its_own_machine(tmp_path):
     device = data.episodes["device_name"].iloc[0]
     assert priced_on(data) == set()
     profile_file(tmp_path)
-    own = "mt10-vision-float32"
+    own = "mt10-h1-float32"
     for name, machines in (("another one", {"there"}), (device, {"there", own})):
         profile_file(tmp_path, own, device=name)
         assert priced_on(data) == machines

@@ -234,10 +234,10 @@ def test_the_chunk_counts_and_is_executed():
 @pytest.mark.parametrize(
     ("target", "spec", "camera", "says"),
     [
-        ("mt10-vision", SPEC, CameraSettings(name="corner4+gripperPOV:75"), ""),
-        ("mt10-vision", SPEC, CameraSettings(name="corner"), "world.camera.name"),
-        ("mt10-vision", SPEC, CameraSettings(name="corner4:60"), "world.camera.name"),
-        ("mt10-vision", SPEC, CameraSettings(size=48), "world.camera.size=48"),
+        ("mt10-h1", SPEC, CameraSettings(name="corner4+gripperPOV:75"), ""),
+        ("mt10-h1", SPEC, CameraSettings(name="corner"), "world.camera.name"),
+        ("mt10-h1", SPEC, CameraSettings(name="corner4:60"), "world.camera.name"),
+        ("mt10-h1", SPEC, CameraSettings(size=48), "world.camera.size=48"),
         ("mt10-state", spec_of("insert-peg"), CameraSettings(), "target 'mt10-state'"),
     ],
 )

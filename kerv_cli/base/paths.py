@@ -12,8 +12,8 @@ from kerv_cli.base.files import storage_errors, visible
 # Pattern of names that can be used for a folder in the results folder: no slash, no leading dot.
 PLAIN_NAME = re.compile(r"\w[\w.+-]{0,199}")
 
-# Names of the shipped policies. A checkout contains all of them, the wheel only `mt10-vision`.
-RELEASED = ("libero-state", "mt10-state", "mt10-vision", "mt10-vision-parallel", "mt50-plain", "mt50-vision")
+# Names of the shipped policies. A checkout contains all of them, the wheel only `mt10-h1`.
+RELEASED = ("libero-state", "mt10-state", "mt10-h1", "mt10-h1-parallel", "mt50-plain", "mt50-vision")
 
 # Name of the file from which a training can resume, in the artifact's folder. Shipped artifacts do not have it.
 RESUME = "resume.pt"

@@ -16,7 +16,7 @@ PROJECTIONS = {name: [device.bandwidth / 1e9, device.flops / 1e12] for name, dev
 class BenchSettings(RunSettings):
     """Settings of `kerv bench`, which compares a target's measured times with the shortest that the device allows."""
 
-    target: str = setting("mt10-vision", "a policy, or a shape of conf/target with random weights")
+    target: str = setting("mt10-h1", "a policy, or a shape of conf/target with random weights")
     dtype: str = choice(
         "auto", "auto", "float32", "bfloat16", "float16", help="number format of a shape; auto: bfloat16 on a GPU"
     )

@@ -155,7 +155,8 @@ _VIEWER_CONTENT = (
 def viewer_files() -> dict[str, tuple[bytes, str]]:
     """Return content and media type of each file of Rerun's web viewer, by the file's name.
 
-    Only the web server in Rerun's package offers these files. It is started for a moment, for this machine alone.
+    Only the web server in Rerun's package offers these files. It is started for a moment, and only this machine can
+    reach it.
     """
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -25,7 +25,7 @@ def target(settings: BuildTargetSettings, as_json: AsJson = False) -> None:
     """Make a target from a published checkpoint, which is not copied, or from a policy by enlarging its trunk.
 
     Examples:
-        kerv build target grow=150m policy.target=mt10-vision name=mt10-150m
+        kerv build target grow=150m policy.target=mt10-h1 name=mt10-150m
         kerv build target checkpoint=models/libero name=libero statistics=libero_spatial crop=true
     """
     if settings.grow.width:

@@ -54,7 +54,7 @@ def doctor(settings: DoctorSettings, as_json: AsJson = False) -> None:
 
     Examples:
         kerv doctor
-        kerv doctor target=mt10-vision
+        kerv doctor target=mt10-h1
     """
     findings: list[Finding] = []
     if settings.policy.target:

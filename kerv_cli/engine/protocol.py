@@ -131,7 +131,7 @@ class PredictsTokens(Protocol):
 
 @runtime_checkable
 class JoinsDrafters(Protocol):
-    """A target that can be compiled together with a drafter, and that can make the drafter larger."""
+    """A target that can be compiled together with a drafter, and can enlarge a drafter as it was enlarged itself."""
 
     def join(self, function: Callable[..., Any], *shapes: tuple[int, ...], repeats: bool = False) -> Any:
         """Compile a function that calls modules of the target and of a compiled drafter.

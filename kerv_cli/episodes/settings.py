@@ -30,7 +30,7 @@ class TimingSettings:
     def check_together(self, prefix: str) -> None:
         if self.clock == REAL and self.latency == PROFILE and not self.profile:
             raise UsageError(
-                f"{prefix}latency=profile: name a document of 'kerv bench', such as {prefix}profile=mt10-vision-float32"
+                f"{prefix}latency=profile: name a document of 'kerv bench', such as {prefix}profile=mt10-h1-float32"
             )
 
 

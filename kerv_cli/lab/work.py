@@ -240,8 +240,8 @@ def work(
 ) -> None:
     """Claim and run blocks (groups of episodes), one after another, until none is left.
 
-    If a setting fails, the failure is reported and the other settings go on. While other workers run all blocks that
-    are left, wait, because the block of a worker that dies is free again.
+    If a setting fails, the failure is reported and the other settings go on. If other workers run all blocks that are
+    left, this one waits for their end, because it can claim the block of a worker that dies.
 
     Args:
         queue: The blocks.

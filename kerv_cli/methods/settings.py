@@ -19,7 +19,7 @@ class PolicySettings:
 
     # expert: the environment's scripted policy, without decoding; remote: the policy behind `url`
     kind: str = choice(MODEL, MODEL, EXPERT, REMOTE, help="what decodes: weights, a script, or a server")
-    target: str = setting("mt10-vision", "name of the policy's weights, or a path")
+    target: str = setting("mt10-h1", "name of the policy's weights, or a path")
     artifacts: dict[str, str | None] = setting(
         lambda: dict.fromkeys(parts("artifact")), "artifacts.KIND=NAME; null: the one beside the target"
     )

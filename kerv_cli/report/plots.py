@@ -103,10 +103,10 @@ def _lighter(colour: str, share: float) -> str:
 
 
 def lines_of(results: Sequence[Result], axis: str) -> Places:
-    """Return for each label the name of the line through its point, and the point's x value.
+    """Return, for each setting's label, the line on which a plot over `axis` shows it, and its x value.
 
-    Settings that differ only in the value of `axis` share a line. A setting without such neighbours has its label as
-    line, and x is None.
+    Settings that differ only in `axis` form a line. A setting that differs otherwise is a line of its own, named by its
+    label, without an x value.
     """
     places: dict[str, tuple[str, float | None]] = {}
     for row in results:

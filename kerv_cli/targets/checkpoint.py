@@ -28,7 +28,7 @@ SCALE = ".scale"  # `<name>.scale` contains the scales of the int8 matrix `<name
 
 @dataclass(frozen=True)
 class Description:
-    """Fields of every description (`<kind>.json`) of an artifact. `sha256` is the hash of its file of weights."""
+    """The fields that the description (`<kind>.json`) of every artifact has. `sha256` is the hash of its weights."""
 
     format: int
     kind: str

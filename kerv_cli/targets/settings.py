@@ -61,7 +61,7 @@ class BuildTargetSettings(RunSettings):
     checkpoint: str = setting("", "folder of a Hugging Face checkpoint")
     family: str = setting("openvla", "kind of target")
     grow: GrowSettings = setting(GrowSettings, "enlarge policy.target to this shape: 60m, 150m, 1b, openvla-7b")
-    base: str = setting("mt10-vision", "the policy that is enlarged")
+    base: str = setting("mt10-h1", "the policy that is enlarged")
     name: str = setting("openvla", "name of the new folder in <results>/artifacts/target")
     replace: bool = setting(False, REPLACE)
     statistics: str | None = setting(None, "data set whose action statistics it uses; null: the only one in it")

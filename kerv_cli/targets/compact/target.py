@@ -283,7 +283,7 @@ class CompactTarget(Compilable):
         return found[:, 0].long(), hidden.view(1, len(tokens), -1).to(self.dtype)
 
     def parallel_pass(self, prompt: Tensor, cache: Cache | None = None) -> Tensor:
-        """Forward learned queries in place of action tokens (docs/methods.md §6).
+        """Return the outputs of learned queries that take the place of action tokens (docs/methods.md §6).
 
         Every query attends to the prompt and to all queries.
         """
