@@ -111,7 +111,7 @@ def test_what_does_not_exist_is_not_found(tmp_path, client):
     number = rows_of_wanted(store.database)[0]
     first = f"/episodes/{number}"
     absent = ("/studies/none/episodes", "/studies/..%2f/failures", "/episodes/0", f"/episodes/{10**30}", "/episodes/x")
-    absent += (f"{first}/film.gif", f"{first}/frames/0", f"{first}/recording.rrd", "/rerun/x")
+    absent += (f"{first}/film.webp", f"{first}/frames/0", f"{first}/recording.rrd", "/rerun/x")
     for path in absent:
         assert client.get(path).status_code == 404, path
     assert client.post(f"{first}/record", headers={"origin": "http://attacker.example"}).status_code == 403
@@ -205,7 +205,7 @@ def test_a_person_gets_from_a_failure_to_its_film_a_decode_and_rerun(browser, ad
     expect(cluster.get_by_text("same tokens as the stored episode")).to_be_visible()
     path = store.rollouts / find_episode(rolled, number).episode.recording
     written = path.stat().st_mtime_ns
-    film = page.request.get(f"{address}/episodes/{number}/film.gif").body()
+    film = page.request.get(f"{address}/episodes/{number}/film.webp").body()
     assert Image.open(io.BytesIO(film)).n_frames == 5  # of 13 steps, at half the speed of 80 steps per second
 
     page.goto(f"{address}/studies/{store.name}/episodes")

@@ -133,7 +133,7 @@ def animated(request: Request) -> Response:
     film = _film(request)
     if not film.frames:
         raise HTTPException(404, "the recording has no camera")
-    return Response(animation(film, SLOWER), media_type="image/gif")
+    return Response(animation(film, SLOWER), media_type="image/webp")
 
 
 def recording(request: Request) -> Response:
@@ -200,7 +200,7 @@ ROUTES = [
     Route("/episodes/{id:int}/film", show_film),
     Route("/episodes/{id:int}/record", record, methods=["POST"]),
     Route("/episodes/{id:int}/frames/{step:int}", frame),
-    Route("/episodes/{id:int}/film.gif", animated),
+    Route("/episodes/{id:int}/film.webp", animated),
     Route("/episodes/{id:int}/recording.rrd", recording),
     Route("/rerun/{name:path}", viewer),
 ]

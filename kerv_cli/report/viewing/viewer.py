@@ -161,7 +161,7 @@ def _read(path: Path, changed: int) -> Film:
 
 
 def animation(film: Film, slower: float = 1.0) -> bytes:
-    """Return a film, which must have frames, as a GIF that plays again and again.
+    """Return a film, which must have frames, as a WebP image that plays again and again.
 
     Args:
         slower: How many times slower the film plays than the robot moved.
@@ -170,5 +170,5 @@ def animation(film: Film, slower: float = 1.0) -> bytes:
     each = max(1, round(hz / FRAMES_PER_SECOND))
     first, *others = [Image.open(io.BytesIO(frame)) for frame in film.frames[::each]]
     buffer = io.BytesIO()
-    first.save(buffer, "gif", save_all=True, append_images=others, duration=round(1000 * each / hz), loop=0)
+    first.save(buffer, "webp", save_all=True, append_images=others, duration=round(1000 * each / hz), loop=0)
     return buffer.getvalue()
