@@ -123,7 +123,7 @@ def test_ancestors_are_the_transitive_closure_of_parents(tree):
 
 @given(trees(), st.integers(0, 9), st.integers(1, 6), st.booleans())
 def test_the_mask_shows_the_cache_what_stands_before_and_the_ancestors(tree, cached, before, fixed):
-    """Of a chain behind causal tokens a draft says nothing: it is causal."""
+    """A draft that is a chain after causal tokens states no mask, because attention is causal without one."""
     like = torch.zeros(())
     cache = CapturedCache(1, 1, 40, 1, like) if fixed else Cache(1, 1, 1, 40, 1, like)
     cache.length = cached

@@ -266,7 +266,7 @@ def test_a_profile_prices_the_records_forwards():
 
 
 def profile_file(folder: Path, **phases: tuple[list[Any], list[Any]]) -> None:
-    """phases: other rows and seconds than those of `PROFILE`."""
+    """phases: rows and seconds that replace the ones in `PROFILE`."""
     document = {"profile": PROFILE.as_dict()}
     document["profile"]["phases"] |= {name: {"rows": costs[0], "seconds": costs[1]} for name, costs in phases.items()}
     path = folder / "bench" / "there.json"

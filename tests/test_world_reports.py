@@ -70,8 +70,8 @@ def test_the_figure_has_a_panel_per_kind_and_a_line_per_method(stressed):
 
 
 def test_the_verdict_says_who_falls_behind_where(stressed):
-    behind, is_shown, _ = verdict_of(stressed.results, 3.0)
-    assert "less successful than the baseline: bold, kind=light level=4 (than ar, kind=light level=4). More" in behind
+    said, is_shown, _ = verdict_of(stressed.results, 3.0)
+    assert "less successful than the baseline: bold, kind=light level=4 (than ar, kind=light level=4). More" in said
     assert not is_shown
     kept = [row for row in stressed.results if (row.stress, row.stress_level) != ("light", 4)]
     assert "less successful than the baseline: no setting. More successful: no setting" in verdict_of(kept, 3.0)[0]

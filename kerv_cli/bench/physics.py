@@ -259,10 +259,10 @@ def encoder_of_weights(weights: float, tokens: int) -> Needs:
 
 
 def vla_shape(name: str, language: Language, prompt: int, encoder: Needs) -> Shape:
-    """Return the shape of a VLA in bfloat16. Its drafters and datastore have the sizes of the shipped ones."""
+    """Return the shape of a VLA in bfloat16, with the shipped drafters and a datastore of 1,000 demonstrations."""
     width, sizes = language.hidden_size, Sizes.of(language, _HALF)
     # The early drafter reads two pooled vectors, has two blocks of 384 units and spreads 32 features over 7 tokens. Its
-    # kernels are counted in the shipped drafter. A datastore has the shipped one's 45,221 keys of 32 numbers.
+    # kernels are counted in the shipped drafter. A datastore of 1,000 demonstrations has 45,221 keys of 32 numbers.
     early = 2 * width * 384 + 6 * 384**2 + 384 * 7 * 32 + 32 * 256
     parts = {
         "encode": encoder,
@@ -272,10 +272,15 @@ def vla_shape(name: str, language: Language, prompt: int, encoder: Needs) -> Sha
     return Shape(name, sizes, language.num_hidden_layers, prompt, parts)
 
 
+def openvla(name: str, language: Language, towers: Sequence[Tower]) -> Shape:
+    encoder = encoder_of(towers, language.hidden_size)
+    return vla_shape(name, language, towers[0].patches + INSTRUCTION, encoder)
+
+
 INSTRUCTION = 25  # assumed number of prompt tokens of an instruction
 GEMMA = Language(257_152, 2048, 16_384, 18, 8, 1)  # PaliGemma's language model, Gemma 2B
 # Shapes by name. The prompt of OpenVLA-7B is 256 patches and an instruction of 25 tokens.
 SHAPES = {
-    "openvla-7b": vla_shape("openvla-7b", Language(), 256 + INSTRUCTION, encoder_of(list(TOWERS.values()), 4096)),
+    "openvla-7b": openvla("openvla-7b", Language(), tuple(TOWERS.values())),
     "pi0-fast": vla_shape("pi0-fast", GEMMA, 3 * 256 + INSTRUCTION, encoder_of_weights(414e6, 3 * 256)),
 }

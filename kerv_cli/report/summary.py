@@ -48,7 +48,7 @@ ANSWER, OF_SERVER = "an answer takes, ms", "of it the server's, ms"
 MEANINGS = {
     "success": "share of episodes that solved their task",
     DIFFERENCE: "points more or less than {0}, over pairs: episodes of both from the same initial state",
-    PER_EPISODE: "inference time of {0} until success or the horizon ÷ that of the setting, over pairs on the same "
+    PER_EPISODE: "inference time of {0} until success or the horizon, divided by the setting's, over pairs on the same "
     "device",
     PER_STEP: "the same for the time of a control step. * means: some pairs were not measured in turn; the "
     "speed is of the others",

@@ -116,7 +116,7 @@ def open_checked(folder: Path, shape: Shape) -> Shards:
     wrong = sorted(name for name in {*shapes, *expected} if shapes.get(name) != expected.get(name))
     if wrong:
         raise CheckpointError(
-            f"the weights in {folder} are not those of its {CONFIG}: {len(wrong)} are missing, unknown or of another "
+            f"the weights in {folder} do not fit its {CONFIG}: {len(wrong)} are missing, unknown or of another "
             f"shape, such as {wrong[0]}"
         )
     return shards
