@@ -290,7 +290,7 @@ def test_a_key_of_no_part_is_refused(results):
 def test_demonstrations_that_do_not_fit_the_target_are_refused(copy):
     write_demos(copy / "artifacts/demos/few", LENGTHS, tail=2)
     with pytest.raises(
-        CheckpointError, match="2 labels after an episode's end, chunks of 4 need 3: take at most 3, or import"
+        CheckpointError, match="2 labels after an episode's end, chunks of 4 need 3: take at most 3, or record or"
     ):
         build(asked(copy))
     write_demos(copy / "artifacts/demos/few", LENGTHS, size=32)

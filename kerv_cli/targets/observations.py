@@ -149,7 +149,7 @@ def check_tail(episode: DemoEpisode, steps: int, use: str) -> None:
     if tail < steps - 1:
         raise CheckpointError(
             f"the demonstrations have {tail} labels after an episode's end, {use} need {steps - 1}: "
-            f"take at most {tail + 1}, or import a dataset with tail={steps - 1}"
+            f"take at most {tail + 1}, or record or import them with tail={steps - 1}"
         )
 
 

@@ -262,6 +262,7 @@ def recording_of(settings: DemosSettings) -> tuple[DemoConfig, PolicyActs | None
         perturbed=settings.perturbed,
         camera=settings.world.camera,
         frame_stride=settings.frame_stride,
+        tail=settings.tail,
         workers=settings.runtime.workers,
         horizon=settings.world.horizon,
         policy=actor.sha256 if actor else "",

@@ -130,6 +130,7 @@ class DemosSettings(MethodSettings, TaskSettings):
     perturbed: float = number(0.5, 0, 1, help="share of episodes in which the expert is disturbed")
     expert_share: float = number(0.3, 0, 1, help="if a policy acts: share of chunks in which the expert acts instead")
     frame_stride: int = number(2, 1, 10_000, help="control steps between two stored images")
+    tail: int = number(8, 0, 1024, help="control steps recorded after the success, for chunks that begin near it")
     world: WorldSettings = setting(WorldSettings, "camera and length of an episode")
 
 
