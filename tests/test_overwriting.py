@@ -250,7 +250,8 @@ def test_a_recording_by_a_policy_honours_the_device_and_the_format(results, monk
     config, actor = recording_of(settings)
     assert actor is not None
     assert str(actor(config).decoder_of("drawer-close-v3").target.dtype) == "torch.bfloat16"
-    other = recording_of(compose("demos", words, DemosSettings))[1]
+    longer, other = recording_of(compose("demos", [*words, "tail=15"], DemosSettings))
+    assert longer.tail == 15  # as the message asks that refuses chunks of sixteen
     assert other is not None
     assert other.sha256 != actor.sha256
     assert plan_demos(settings).text.startswith("1 task x 100 episodes")
