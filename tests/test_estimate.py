@@ -157,7 +157,7 @@ def test_no_acceptance_is_taken_from_other_chunks_and_no_ceiling_beats_one_forwa
     """Only `accepted=` sets the acceptance. Other chunk lengths change the speed, not the acceptance."""
     shown = drafts("weights=7B", "tokens=7", "accepted=0.6")
     assert all(list(one["speeds"]) == ["0.6"] for one in shown.values())
-    for tokens in (2, 7, 64):
+    for tokens in (2, 7, 128):
         for one in drafts("weights=7B", f"tokens={tokens}").values():
             assert one["ceiling"] <= tokens
     high, low = (drafts("weights=7B", f"accepted={chance}") for chance in (1, 0))
@@ -207,7 +207,7 @@ def test_a_flow_policy_is_told_what_applies(words):
     assert json.loads(told("estimate", *words, "--json"))["applies"] is False
 
 
-@pytest.mark.parametrize("words", [("tokens=1",), ("tokens=64",), ("weights=1M",), ("weights=400B",)])
+@pytest.mark.parametrize("words", [("tokens=1",), ("tokens=128",), ("weights=1M",), ("weights=400B",)])
 def test_extremes_are_answered(words):
     words = words if any("weights" in word for word in words) else ("weights=7B", *words)
     assert "what pays first is" in told("estimate", *words)
@@ -238,7 +238,7 @@ def test_wrong_words_are_refused():
     assert "leave out weights" in refusal("estimate", "on=epyc-vla-150m", "weights=7B", code=2)
     for word in ("weights=many", "weights=7T", "weights=-7B", "weights=nan", "weights=config.json"):
         assert "such as 7B" in refusal("estimate", word, code=2)
-    for word in ("accepted=2", "accepted=[]", "tokens=65", "hz=0", "model=openvla-7b", "trace=FILE"):
+    for word in ("accepted=2", "accepted=[]", "tokens=129", "hz=0", "model=openvla-7b", "trace=FILE"):
         assert word.partition("=")[0] in refusal("estimate", "weights=7B", word, code=2)
 
 

@@ -112,6 +112,14 @@ def test_the_weights_are_those_of_the_published_checkpoint():
     assert 1e3 * 2 * encoder / DEVICES["h100"].bandwidth >= 0.44
 
 
+def test_pi0_fast_has_gemmas_weights_and_drafts_action_tokens_alone():
+    """Gemma 2B has 2.51 billion weights with its embeddings, which are its head, and 18 layers with keys of 256."""
+    sizes = SHAPES["pi0-fast"].sizes
+    assert sizes.trunk_weights == pytest.approx(2.506e9, rel=2e-3)
+    assert sizes.cached == 18 * 2 * 256
+    assert sizes.drafter < sizes.head / 4
+
+
 def test_a_share_of_the_peak_and_the_launches_bound_a_phase():
     tuned, device = ENGINES["tuned"], Device("slow", 1e9, 1e15)
     needs = OPENVLA.needs("verify", 1)

@@ -20,9 +20,9 @@ _HALF = 2.0  # bytes of a bfloat16 number
 _TREE_WIDTH = 8  # nodes per level of the drafter's tree
 _TRUNK, _CHAIN, _LEVEL = 21, 13, 31  # kernels outside the layers, counted: of a trunk, a drafted token, a tree's level
 _ENCODER = 20  # kernels of an encoder outside its blocks
-_ROWS = (1, 2, 4, 8, 16, 32, 64)
+_ROWS = (1, 2, 4, 8, 16, 32, 64, 128)
 SYSTEM = "system time"
-CHUNK = 64  # largest number of tokens per chunk for which a computed profile has times
+CHUNK = 128  # largest number of tokens per chunk for which a computed profile has times
 
 
 @dataclass(frozen=True)
@@ -155,12 +155,19 @@ class Sizes:
     drafter_padding: int = 0
 
     @classmethod
-    def of(cls, language: Language, number: float) -> Sizes:
-        """Return the sizes of a Llama-style target and its one-layer drafter. `number`: bytes of a weight."""
-        width, layers = language.hidden_size, language.num_hidden_layers
-        layer = 4 * width**2 + 3 * width * language.intermediate_size
-        head, channels, cached = width * language.vocab_size, layers * width, 2 * layers * width
-        return cls(layers * layer, head, layer + 2 * width**2 + head, channels, cached, number, number)
+    def of(cls, language: Language, number: float, drafted: int = 0, keys: int = 0) -> Sizes:
+        """Return the sizes of a Llama-style target and its one-layer drafter.
+
+        Args:
+            number: Bytes of a weight.
+            drafted: Number of tokens that the drafter chooses from, whose rows of the head it reads. 0: all tokens.
+            keys: Number of channels of a key, all heads together. 0: the hidden size.
+        """
+        width, layers, keys = language.hidden_size, language.num_hidden_layers, keys or language.hidden_size
+        layer = 2 * width * (width + keys) + 3 * width * language.intermediate_size
+        head, channels, cached = width * language.vocab_size, layers * width, 2 * layers * keys
+        drafter = layer + width * (2 * width + (drafted or language.vocab_size))
+        return cls(layers * layer, head, drafter, channels, cached, number, number)
 
     @property
     def trunk_weights(self) -> int:
@@ -258,9 +265,12 @@ def encoder_of_weights(weights: float, tokens: int) -> Needs:
     return Needs(_HALF * weights, 2.0 * weights * tokens, blocks=blocks, kernels=_ENCODER * bool(weights), asks=True)
 
 
-def vla_shape(name: str, language: Language, prompt: int, encoder: Needs) -> Shape:
-    """Return the shape of a VLA in bfloat16, with the shipped drafters and a datastore of 1,000 demonstrations."""
-    width, sizes = language.hidden_size, Sizes.of(language, _HALF)
+def vla_shape(name: str, language: Language, prompt: int, encoder: Needs, **sizes: int) -> Shape:
+    """Return the shape of a VLA in bfloat16, with the shipped drafters and a datastore of 1,000 demonstrations.
+
+    `sizes`: `drafted` and `keys` of `Sizes.of`.
+    """
+    width, trunk = language.hidden_size, Sizes.of(language, _HALF, **sizes)
     # The early drafter reads two pooled vectors, has two blocks of 384 units and spreads 32 features over 7 tokens. Its
     # kernels are counted in the shipped drafter. A datastore of 1,000 demonstrations has 45,221 keys of 32 numbers.
     early = 2 * width * 384 + 6 * 384**2 + 384 * 7 * 32 + 32 * 256
@@ -269,7 +279,7 @@ def vla_shape(name: str, language: Language, prompt: int, encoder: Needs) -> Sha
         "early": Needs(_HALF * early, 2.0 * early, kernels=57),
         "retrieval": Needs(_HALF * 45_221 * 32, 2.0 * 45_221 * 32, kernels=10),
     }
-    return Shape(name, sizes, language.num_hidden_layers, prompt, parts)
+    return Shape(name, trunk, language.num_hidden_layers, prompt, parts)
 
 
 def openvla(name: str, language: Language, towers: Sequence[Tower]) -> Shape:
@@ -278,9 +288,11 @@ def openvla(name: str, language: Language, towers: Sequence[Tower]) -> Shape:
 
 
 INSTRUCTION = 25  # assumed number of prompt tokens of an instruction
-GEMMA = Language(257_152, 2048, 16_384, 18, 8, 1)  # PaliGemma's language model, Gemma 2B
+GEMMA = Language(257_152, 2048, 16_384, 18, 8)  # PaliGemma's language model, Gemma 2B; its heads share a key of 256
+# Only the 2,048 tokens of the published FAST tokenizer are drafted. The target still ranks all 257,152.
+PI0_FAST = {"drafted": 2048, "keys": 256}
 # Shapes by name. The prompt of OpenVLA-7B is 256 patches and an instruction of 25 tokens.
 SHAPES = {
     "openvla-7b": openvla("openvla-7b", Language(), tuple(TOWERS.values())),
-    "pi0-fast": vla_shape("pi0-fast", GEMMA, 3 * 256 + INSTRUCTION, encoder_of_weights(414e6, 3 * 256)),
+    "pi0-fast": vla_shape("pi0-fast", GEMMA, 3 * 256 + INSTRUCTION, encoder_of_weights(414e6, 3 * 256), **PI0_FAST),
 }
