@@ -26,6 +26,7 @@ from kerv_cli.base.manifests import read_file
 from kerv_cli.base.paths import find_target, shipped_dir
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.chunk import Chunk, Follower
+from kerv_cli.engine.decoder import Decoder
 from kerv_cli.engine.record import Round, variability
 from kerv_cli.lab.database import Database
 from kerv_cli.methods.artifacts import MadeFor
@@ -211,6 +212,20 @@ def test_a_reference_level_is_the_median_of_the_decodes_and_divides():
     assert found == pytest.approx([33 * BIN, 3 * BIN, 3 * BIN])
     assert level(off_by(0), off_by(0)).levels["sum of accepted"] == BIN
     assert level(Round("verify", "x", 0, (9,), (9,), 1, 1, 1, ())).k_s == BIN / 12  # one token off by one bin
+
+
+def test_a_policy_that_sees_no_image_is_calibrated_on_all_control_steps(results, monkeypatch):
+    """Its demonstrations may have one image each, at the first step: LIBERO's are recorded so."""
+    load, decoded = DemoDataset.load, []
+    first = np.zeros(1, dtype=np.int64)
+    monkeypatch.setattr(DemoDataset, "load", lambda self, index: replace(load(self, index), frame_steps=first))
+    monkeypatch.setattr(Decoder, "decode", recording(Decoder.decode, decoded))
+    calibrated(results, "decodes=60", "policy.target=nano-state")
+    assert len({tuple(observation.state) for observation in decoded}) > 12
+
+
+def recording(decode: Callable[..., Any], seen: list[Any]) -> Callable[..., Any]:
+    return lambda self, observation: seen.append(observation) or decode(self, observation)
 
 
 @pytest.mark.parametrize("target", ["nano-state", "nano-vision"])

@@ -36,7 +36,7 @@ from kerv_cli.methods.heisd.curvature import BoundaryRanges
 from kerv_cli.methods.heisd.datastore import Datastore
 from kerv_cli.methods.kerv.prediction import Noise, kalman_weights
 from kerv_cli.targets.checkpoint import TargetDescription
-from kerv_cli.targets.observations import check_tail, observations_of
+from kerv_cli.targets.observations import check_tail, observations_of, observed_steps
 from kerv_cli.targets.provenance import provenance_of
 from kerv_cli.training.demonstrations import check_tasks, demos_for
 from kerv_cli.training.fit import FEW, timed
@@ -176,8 +176,9 @@ def episode_decodes(decoder: Decoder, dataset: DemoDataset, index: int, decodes:
     The decoder also gets every action executed in between, because some methods use a history.
     """
     episode = dataset.load(index)
-    rows = np.unique(np.linspace(0, len(episode.frame_steps) - 1, decodes).round().astype(int))
-    steps, records, executed = episode.frame_steps[rows], [], 0
+    seen = observed_steps(episode, bool(decoder.target.cameras))
+    rows = np.unique(np.linspace(0, len(seen) - 1, decodes).round().astype(int))
+    steps, records, executed = seen[rows], [], 0
     observations = observations_of(decoder.target, episode, steps, dataset.manifest.observation)
     decoder.reset(episode.task, episode.seed, episode.end_effector[0])
     for step, observation in zip(steps, observations, strict=True):
