@@ -229,12 +229,17 @@ def test_the_decoder_is_told_what_was_executed(policy):
 
 
 @pytest.mark.parametrize(
-    ("gripper", "values"), [("as_is", [0.1, 0.9]), ("signed", [-1, 1]), ("signed_inverted", [1, -1])]
+    ("gripper", "values"), [("as_is", [-0.4, 0.9]), ("signed", [1, -1]), ("signed_inverted", [-1, 1])]
 )
 def test_grippers(policy, gripper, values):
-    made = replace(policy.interface, gripper=gripper).converted(np.array([[0.3, 0, 0, 0.1], [0, 0, 0, 0.9]]))
+    """Meta-World's policy opens with -1 and closes with 1; one of no environment closes with 0 and opens with 1."""
+    own = replace(policy.interface, gripper=gripper)
+    made = own.converted(np.array([[0.3, 0, 0, -0.4], [0, 0, 0, 0.9]]))
     np.testing.assert_allclose(made[:, 3], values)
     np.testing.assert_allclose(made[:, 0], [0.3, 0])
+    if gripper != "as_is":
+        foreign = replace(own, spec=None).converted(np.array([[0, 0, 0, 0.9], [0, 0, 0, 0.1]]))
+        np.testing.assert_allclose(foreign[:, 3], values)
 
 
 def test_a_server_that_cannot_start_says_so(policies):

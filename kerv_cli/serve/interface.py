@@ -22,14 +22,15 @@ class Interface:
     """What a policy reads and sends.
 
     Args:
-        gripper: How the gripper's value (0 closed to 1 open) is sent: `as_is`, `signed` (-1 closed, 1 open) or
-            `signed_inverted` (1 closed, -1 open).
+        gripper: How the gripper's value is sent: `as_is`, `signed` (-1 closed, 1 open) or `signed_inverted` (1 closed,
+            -1 open).
 
     Attributes:
         space: Action space of the environment, or of the policy if kerv does not know the environment.
         size: Side of an image in pixels. 0 if the policy reads no images.
         privileged: Whether the policy reads the whole simulator state, not only proprioception.
-        grip: The two gripper values in the environment's actions: first to close, then to open. Empty if unknown.
+        grip: The two gripper values in the environment's actions: first to close, then to open. Empty if the policy is
+            of no environment of kerv's: 0 then closes the gripper and 1 opens it, as in OpenVLA.
     """
 
     description: TargetDescription
@@ -85,7 +86,9 @@ class Interface:
         """Return the policy's actions (H, D) as float64, environment units, the gripper in the client's convention."""
         values, strict = actions.astype(np.float64), self.actions.is_strict
         if self.gripper in OPEN:
-            values[:, strict] = np.where(values[:, strict] > 0.5, OPEN[self.gripper], -OPEN[self.gripper])
+            closed, opened = self.grip or (0.0, 1.0)
+            is_open = (values[:, strict] - (closed + opened) / 2) * (opened - closed) > 0
+            values[:, strict] = np.where(is_open, OPEN[self.gripper], -OPEN[self.gripper])
         return values
 
 

@@ -19,7 +19,7 @@ class ServeSettings(MethodSettings):
     host: str = setting("127.0.0.1", "address to listen on; there is no password")
     port: int = number(8000, 0, 65_535, help="port to listen on; 0: a free one")
     gripper: str = choice(
-        "as_is", "as_is", "signed", "signed_inverted", help="how the gripper (0 closed to 1 open) is sent"
+        "as_is", "as_is", "signed", "signed_inverted", help="how the gripper is sent: signed is -1 closed, 1 open"
     )
     task_name: str = setting("", "name of the task, if its calibration is read; vla_eval's clients send it")
     origins: list[str] = setting([], "addresses of web pages that may connect; programs always may")
