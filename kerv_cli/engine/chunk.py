@@ -69,6 +69,15 @@ class Follower:
         self.path.append(np.asarray(end_effector))
         del self.planned[:1]
 
+    def starts(self, planned: Sequence[np.ndarray], dropped: int) -> None:
+        """Begin to execute a chunk that other actions were executed during the decode of (`rollout.clock=real`).
+
+        Args:
+            planned: The chunk's normalised actions that are to be executed.
+            dropped: Number of actions at its start that come too late, and are not in `planned`.
+        """
+        self.planned = list(planned)
+
     def history(self, pending: np.ndarray | None = None) -> np.ndarray:
         """Return the last executed actions (m, D), oldest first, normalised and not rounded to tokens; m ≤ WINDOW.
 

@@ -123,9 +123,10 @@ class _Execution:
 
     def during(self, delay: Delay) -> Delay:
         # carried: steps that executed the rest of the previous chunk; held: steps that repeated the last action
-        before, in_chunk = len(self.actions), len(self.chunk)
+        before, in_chunk, planned = len(self.actions), len(self.chunk), list(self.follower.planned)
         while len(self.actions) < before + delay.steps and not self.world.done:
             self.step()
+        self.follower.starts(planned[delay.dropped :], delay.dropped)
         carried = in_chunk - len(self.chunk)
         return dataclasses.replace(delay, carried=carried, held=len(self.actions) - before - carried)
 

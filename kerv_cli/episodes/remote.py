@@ -7,7 +7,7 @@ import math
 import socket
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -226,6 +226,10 @@ class RemoteDecoder(Follower):
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
         super().observe(action, end_effector)
         self._done += 1
+
+    def starts(self, planned: Sequence[np.ndarray], dropped: int) -> None:
+        super().starts(planned, dropped)
+        self._done = dropped
 
     def decode(self, observation: Observation) -> DecodeRecord:
         """Return a record with the server's actions. Its `seconds` are the time from the observation to the actions.
