@@ -183,10 +183,11 @@ def test_the_peg_is_carried_without_being_dragged():
 
 
 def test_what_ours_did_is_told_from_what_metaworlds_did():
-    """In the identity of an expert's cells, and in a recording's configuration; of other tasks nothing changes."""
-    peg, reach = (compose("rollout", ["policy=expert", f"task={task}"], RolloutSettings) for task in (PEG, "reach"))
-    assert check(peg)["expert"] == f"{PEG} {VERSION}"
-    assert "expert" not in check(reach)
+    """In the identity of an expert's episodes, the same for any list of tasks, and in a recording's configuration."""
+    lists = (PEG, "reach", f"[{PEG},reach]")  # a worker checks the tasks of a plan one by one
+    found = [check(compose("rollout", ["policy=expert", f"task={names}"], RolloutSettings)) for names in lists]
+    assert f"{PEG} {VERSION}" in found[0]["expert"]
+    assert found[0] == found[1] == found[2]
     configs = [_identity(DemoConfig((task,), episodes=1))["config"] for task in (PEG, "reach-v3")]
     assert [config.get("experts") for config in configs] == [{PEG: VERSION}, None]
 

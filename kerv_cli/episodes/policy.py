@@ -63,7 +63,7 @@ def check(settings: RolloutSettings, is_awaited: bool = False) -> dict[str, str]
         return _check_remote(settings, spec, is_awaited)
     if settings.policy.kind == EXPERT:
         spec.check_experts(tasks)
-        experts = ";".join(f"{task} {spec.experts[task]}" for task in sorted(tasks) if task in spec.experts)
+        experts = ";".join(f"{task} {expert}" for task, expert in sorted(spec.experts.items()))
         return {"target": "", **({"expert": experts} if experts else {}), OBSERVATION: PRIVILEGED}
     artifacts = artifacts_of(settings)
     target = artifacts.description
