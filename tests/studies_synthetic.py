@@ -112,9 +112,10 @@ def swept(
     rerun: str = "never",
     runtime: RuntimeSettings | None = None,
     on_event: OnEvent = lambda event: None,
+    words: Sequence[str] = (),
 ) -> tuple[Study, Outcome]:
-    """Runs what the database of a results folder lacks of a study."""
-    command = ["sweep", f"study={study.name}"]
+    """Runs what the database of a results folder lacks of a study. `words`: what the command names besides it."""
+    command = ["sweep", f"study={study.name}", *words]
     plan = planned(opened(results), study, rerun, runtime=runtime, command=command)
     prepare = prepare or episodes_of
     # variables of a process are set for its worker processes alone: two threads that sweep would restore each other's

@@ -18,12 +18,23 @@ from conftest import python, refused, until
 from studies_synthetic import episode, settings_of, study_of, swept, threshold_study
 
 from kerv_cli.base.errors import CheckpointError, StorageError, UsageError
+from kerv_cli.cli.common import with_results
 from kerv_cli.episodes.rows import decodes_table, episode_row
 from kerv_cli.lab import database as module
 from kerv_cli.lab.command import STORE, noted, without_passwords
 from kerv_cli.lab.database import BLOCKS, DECODES, EPISODES, FILE, RUNS, STUDIES, WANTED, Database, Unanswered, opened
 from kerv_cli.lab.runs import Run, making, pulse, run_rows, time_left
-from kerv_cli.lab.store import Study, counts_of, decodes_of, frame_of, loaded, remove_study, studies, version_of
+from kerv_cli.lab.store import (
+    Study,
+    counts_of,
+    decodes_of,
+    frame_of,
+    loaded,
+    remove_study,
+    studies,
+    sweep_command,
+    version_of,
+)
 from kerv_cli.training.demonstrations import open_demos
 
 STUDY = threshold_study(["reach-v3"])
@@ -422,12 +433,18 @@ def test_a_store_is_used_by_one_command_and_no_password_is_kept(tmp_path, monkey
     url, where = f"sqlite:///{tmp_path}/other.db", f"results={tmp_path}"
     other = Database(tmp_path, url)
     assert other.words == [where, f"store={url}"]  # a suggested command works as it is printed
+    with noted(["sweep", "study=demo", f"store={url}", where]), Run(other, "sweep", "demo"):
+        pass
+    suggested = sweep_command(Study(other, "demo"), "episodes=9")
+    assert suggested.split() == ["kerv", "sweep", "study=demo", "episodes=9", where, f"store={url}"]
+    assert with_results(f"run '{suggested}'", [where, f"store={url}"]) == f"run '{suggested}'"
+    told(*suggested.split()[1:], "--cfg")
     (tmp_path / "artifacts/target/openvla").mkdir(parents=True)  # without a folder the command would leave no row
     told("build", "target", f"checkpoint={tmp_path}", f"store={url}", where, code=1)
-    assert [row.status for row in run_rows(other)] == ["failed"]
+    assert [row.status for row in run_rows(other, "target")] == ["failed"]
     assert run_rows(opened(tmp_path)) == []
     monkeypatch.setenv(STORE, url)
-    assert len(run_rows(opened(tmp_path))) == 1
+    assert len(run_rows(opened(tmp_path), "target")) == 1
     assert run_rows(Database(tmp_path)) == []  # only the command itself reads the variable
     monkeypatch.delenv(STORE)
     store = "store=postgresql://me:secret@127.0.0.1:1/kerv"

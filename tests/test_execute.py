@@ -726,3 +726,6 @@ def test_a_sweep_without_workers_says_how_to_start_some(tmp_path):
             raise KeyboardInterrupt
     assert said == [f"start workers, as many as you like: kerv work study=threshold results={tmp_path}"]
     assert (queued(store.database), counts_of(store)) == (0, (0, 16))
+    other = planned(Database(tmp_path, f"sqlite:///{tmp_path}/other.db"), STUDY, runtime=RuntimeSettings(workers=0))
+    with workers(other, "", said.append):
+        assert said[1].endswith(f"results={tmp_path} store=sqlite:///{tmp_path}/other.db")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import shlex
 from dataclasses import asdict
 from typing import Any
 
@@ -11,11 +12,12 @@ from conftest import raising
 from studies_synthetic import IDENTITY, part, planned, settings_of, study_of, swept, threshold_study
 
 from kerv_cli.base.errors import Interrupted, UsageError
+from kerv_cli.cli.sweep import tables
 from kerv_cli.episodes import identity
 from kerv_cli.episodes.identity import ENGINE, Setting, hash_of, without
 from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.plan import Block, all_episodes, blocks_of
-from kerv_cli.lab.store import Study, counts_of, frame_of, loaded, remove_study, row_of
+from kerv_cli.lab.store import Study, counts_of, frame_of, loaded, remove_study, row_of, sweep_command
 from kerv_cli.lab.study import plan_study
 from kerv_cli.report.summary import not_in_turn
 from kerv_cli.report.tables import load_study
@@ -184,6 +186,29 @@ def test_two_labels_of_one_result_run_once(database):
     store, outcome = swept(database.results, study)
     assert len(outcome.done) == 4
     assert counts_of(store) == (8, 8)
+    data = tables(store, outcome)
+    assert data is not None
+    assert [row.episodes for row in data.results] == [4, 4]  # both rows have them
+
+
+@on_sqlite
+def test_a_sweep_shows_what_a_report_of_the_same_study_shows(database):
+    """Speeds over three runs, if three commands ran all of it."""
+    study = threshold_study(["reach-v3"])
+    for rerun in ("never", "all", "all"):
+        store, outcome = swept(database.results, study, rerun=rerun)
+    data = tables(store, outcome)
+    assert data is not None
+    assert len(data.runs) == len(load_study(store).runs) == 3
+
+
+@on_sqlite
+def test_a_suggested_sweep_names_the_tasks_of_earlier_sweeps(database):
+    for tasks in (["reach-v3"], ["push-v3"]):
+        store, _ = swept(database.results, threshold_study(tasks), words=[f"task={tasks[0]}"])
+    whole = loaded(store)
+    suggested = shlex.split(sweep_command(whole, "episodes=9"))
+    assert suggested[2:5] == ["study=threshold", "episodes=9", "task=[reach-v3,push-v3]"]
 
 
 @on_sqlite

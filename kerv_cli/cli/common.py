@@ -158,7 +158,8 @@ def with_results(message: str, words: Iterable[str]) -> str:
         known = parts("command")  # only now: if a plugin cannot be imported, nothing is known
         typed = command.split()[1:]
         part = known.get(" ".join(typed[:2])) or known.get(typed[0])
-        is_elsewhere = part is not None and hasattr(part.settings, "results") and "results=" not in command
+        is_elsewhere = part is not None and hasattr(part.settings, "results")
+        is_elsewhere = is_elsewhere and not re.search(r"\b(results|store)=", command)
         return f"{quote}{command}{where if is_elsewhere else ''}{quote}"
 
     return re.sub(r"(['`])(kerv [a-z].*?)\1(?!\w)", complete, message)

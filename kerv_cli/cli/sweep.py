@@ -108,11 +108,17 @@ def _list_studies(as_json: bool) -> None:
 
 
 def tables(study: Study, outcome: Outcome) -> StudyData | None:
-    """Read the results of a sweep's episodes. Return None if no episode has ended."""
+    """Read the results of a sweep's episodes. Return None if no episode has ended.
+
+    The study in the database may have more tasks, from earlier sweeps. If it has not, this is what `kerv report` reads.
+    """
+    from kerv_cli.lab.store import counts_of
     from kerv_cli.report.tables import load_study
 
-    there = [*outcome.done, *outcome.reused]
-    return load_study(study, there) if there else None
+    failed = {one for failure in outcome.failed for one in failure.episodes}
+    there = [one for one in study.episodes if one not in failed]
+    is_whole = len(there) == counts_of(study)[1]
+    return load_study(study, None if is_whole else there) if there else None
 
 
 def print_outcome(study: Study, outcome: Outcome, data: StudyData | None, as_json: bool) -> None:
@@ -143,7 +149,6 @@ def write(study: Study, outcome: Outcome, data: StudyData | None, loss: float) -
 
     if data is None or outcome.failed:
         return
-    # the study in the database may have more tasks, from earlier sweeps
     is_whole = counts_of(study)[1] == len(data.study.episodes)
     report = write_study(data if is_whole else load_study(study), loss)
     print_prices(report.priced)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import sqlalchemy as sa
 
-from kerv_cli.base.config import groups
+from kerv_cli.base.config import as_overrides, groups
 from kerv_cli.base.errors import UsageError, did_you_mean
 from kerv_cli.base.limits import check_label
 from kerv_cli.base.paths import check_name
@@ -120,18 +120,28 @@ def how_to_run(study: Study) -> str:
 def sweep_command(study: Study, *overrides: str) -> str:
     """Return the newest command that ran the study as a sweep, or `kerv sweep study=NAME` if none is stored.
 
+    If commands with other tasks ran the study before, the tasks of all of them are named.
+
     Args:
         overrides: Further overrides to append. They replace stored overrides of the same keys.
     """
-    typed = swept_by(study) or ("sweep", f"study={study.name}")
-    replaced = {"results", "rerun", *(word.partition("=")[0] for word in overrides)}
+    sweeps = _sweeps(study)
+    typed = next(iter(sweeps), ("sweep", f"study={study.name}"))
+    if len({tuple(word for word in words if word.startswith("task=")) for words in sweeps}) > 1 and study.tasks:
+        overrides = *overrides, *as_overrides(task=study.tasks)
+    replaced = {"results", "store", "rerun", *(word.partition("=")[0] for word in overrides)}
     kept = [word for word in typed if word.partition("=")[0] not in replaced and not word.startswith("-")]
     return shlex.join(["kerv", *kept, *overrides, *study.database.words])
 
 
 def swept_by(study: Study) -> tuple[str, ...]:
+    return next(iter(_sweeps(study)), ())
+
+
+def _sweeps(study: Study) -> list[tuple[str, ...]]:
+    """Return the commands that ran the study as a sweep, newest first."""
     rows = run_rows(study.database, SWEEP, study.name)
-    return next((tuple(row.command) for row in rows if row.command[:1] == ["sweep"]), ())
+    return [tuple(row.command) for row in rows if row.command[:1] == ["sweep"]]
 
 
 def studies(database: Database) -> list[Study]:

@@ -127,7 +127,7 @@ def workers(plan: Plan, run: str, say: Callable[[str], object] = lambda line: No
     if plan.blocks and is_elsewhere(runtime):
         words = as_overrides(study=study.name, results=str(study.database.results.absolute()))
         if study.database.store and not sa.make_url(study.database.store).password:
-            words.append(f"store={study.database.shown}")
+            words.append(study.database.words[-1])
         line = shlex.join(["kerv", "work", *words])
         if runtime.launch:
             _launch(runtime.launch.replace("{command}", line).replace("{workers}", str(runtime.workers)), environment)
