@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import re
-import secrets
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -25,7 +24,7 @@ from kerv_cli.episodes.resolve import ResolvedStudy, located
 from kerv_cli.lab.database import EPISODES, PLANNED, RUNS, SETTINGS, STUDIES, UNFINISHED, WANTED, Database, now
 from kerv_cli.lab.plan import ALL, NEVER, Block, Episode, all_episodes, blocks_of, ordered_parts, split
 from kerv_cli.lab.runs import interrupted, living
-from kerv_cli.lab.store import ABOUT, SWEEP, Study, counts_of, row_of, rows_of, setting_of, stored_episodes, swept_by
+from kerv_cli.lab.store import ABOUT, SWEEP, Study, counts_of, rows_of, setting_of, stored_episodes, swept_by
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,10 +125,9 @@ def _check_source(study: Study, command: Sequence[str]) -> None:
 
 
 def new_name(study: Study) -> str:
-    """Return a name for a new rollout, with date, time and methods: `20260301-142530-ar-spec_vla`."""
+    """Return a name for a new rollout, with date, time and methods: `20260301-142530-048151-ar-spec_vla`."""
     methods = "-".join(dict.fromkeys(str(setting.settings["method"]) for setting in study.settings))
-    name = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{re.sub(r'[^A-Za-z0-9_.-]', '_', methods)[:32]}"
-    return f"{name}-{secrets.token_hex(2)}" if row_of(replace(study, name=name)) else name
+    return f"{datetime.now(UTC):%Y%m%d-%H%M%S-%f}-{re.sub(r'[^A-Za-z0-9_.-]', '_', methods)[:32]}"
 
 
 def plan_study(
