@@ -1,6 +1,7 @@
 """The compact target reads its spaces, its checkpoints, grows without changing a token, and decodes all at once."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -328,6 +329,8 @@ def test_it_continues_an_autoregressive_target_with_fresh_queries():
     made = continued_target(shape_of("target.parallel=true"), plain, "")
     assert torch.equal(made.head.weight, plain.head.weight)
     assert made.queries.shape == (16, plain.width)
+    longer = continued_target(replace(shape_of("target.parallel=true"), chunk=8), made, "")
+    assert longer.queries.shape == (32, plain.width)
     described = type("D", (), {"settings": vars(plain.settings), "cameras": plain.cameras})()
     check_init(shape_of("target.parallel=true"), "", described, Path("x"))
     with pytest.raises(UsageError):

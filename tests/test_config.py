@@ -3,7 +3,7 @@
 import re
 import time
 from collections.abc import Iterator
-from dataclasses import Field, asdict, fields, is_dataclass
+from dataclasses import Field, asdict, fields, is_dataclass, replace
 from typing import Any, get_args, get_type_hints
 
 import pytest
@@ -12,6 +12,7 @@ from command import refusal, told
 from conftest import refused
 
 import kerv_cli.cli.app  # noqa: F401 - registers the commands
+from kerv_cli.base.codes import FastCode
 from kerv_cli.base.config import _composed, compose, conf_dir, expand, groups, swept_keys
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.limits import check_label, check_settings, description
@@ -24,6 +25,7 @@ from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import Study, how_to_run
 from kerv_cli.methods.compose import Method
+from kerv_cli.targets.checkpoint import read_target
 from kerv_cli.training.preparation import needs
 from kerv_cli.worlds.libero.spec import SPEC as LIBERO
 
@@ -90,7 +92,10 @@ def test_a_quick_preparation_makes_what_the_methods_of_the_own_study_need():
     quick = compose("prepare", ["quick=true"], SCHEMAS["prepare"])
     assert quick.steps < compose("train_drafter", [], SCHEMAS["train_drafter"]).train.steps
     of_study = {kind for one in resolve(["study=own"]).settings.values() for kind in Method.of(one).needs}
-    assert set(needs(tuple(quick.methods))) == of_study
+    target = read_target(find_target("results", "mt10-h1"))
+    assert set(needs(quick.methods, target)) == of_study
+    coded = replace(target, actions=replace(target.actions, code=FastCode(4, 4, 10.0)))
+    assert {"drafter", "early"} <= set(needs([], coded)) <= set(needs([], target)) - {"calibration"}
 
 
 @pytest.mark.parametrize("row", range(max(map(len, PARTS.values()))))

@@ -104,6 +104,8 @@ def test_the_weights_belong_to_the_runs_identity_and_their_name_does_not(with_ol
 def test_scores_with_and_without_success_are_of_different_runs(with_old):
     alone, some, more = (identity_of(TrainSettings(closed_loop=n), Demos()) for n in (0, 1, 2))  # type: ignore[arg-type]
     assert some == more != alone
+    smaller = identity_of(TrainSettings(stored="int8"), Demos())  # type: ignore[arg-type]
+    assert smaller != alone  # a finished training is not said to be done in a format that was never written
 
 
 @pytest.mark.parametrize(

@@ -24,10 +24,17 @@ from kerv_cli.targets import checkpoint
 from kerv_cli.targets.checkpoint import TargetDescription
 
 TARGET = "target"
-AGAIN = (  # how to measure a calibration again
-    "run 'kerv calibrate replace=true' with the same policy.target= and policy.artifacts=; for a shipped policy "
-    "policy.artifacts.calibration=NAME instead of replace=true"
-)
+
+
+def measured_again(*words: str) -> str:
+    """Return what to type to measure a calibration again, with further overrides."""
+    return (
+        f"run '{' '.join(['kerv calibrate', *words, 'replace=true'])}' with the same policy.target= and "
+        "policy.artifacts=; for a shipped policy policy.artifacts.calibration=NAME instead of replace=true"
+    )
+
+
+AGAIN = measured_again()
 
 
 T = TypeVar("T")

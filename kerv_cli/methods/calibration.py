@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.engine.record import MEAN
-from kerv_cli.methods.artifacts import AGAIN, Artifact, MadeFor, Use, check_sources
+from kerv_cli.methods.artifacts import AGAIN, Artifact, MadeFor, Use, check_sources, measured_again
 from kerv_cli.methods.heisd import FusedBoundarySettings
 from kerv_cli.methods.heisd.curvature import BoundaryRanges
 from kerv_cli.methods.kerv import KinematicThresholdSettings
@@ -121,7 +121,7 @@ class Calibration:
         if task not in self.variability:
             raise CheckpointError(
                 f"the calibration has no reference level K_S for {task}, only for "
-                f"{', '.join(self.variability) or 'no task'}: run 'kerv calibrate task={task}'"
+                f"{', '.join(self.variability) or 'no task'}: {AGAIN}"
             )
         row = self.variability[task]
         if measure != MEAN and measure not in row.levels:
@@ -138,7 +138,7 @@ class Calibration:
         if str(window) not in windows:
             raise CheckpointError(
                 f"the calibration's ranges were taken over {', '.join(windows)} positions, the boundary looks at "
-                f"{window}: run 'kerv calibrate boundary_windows=[{','.join([*windows, str(window)])}]'"
+                f"{window}: " + measured_again(f"boundary_windows=[{','.join([*windows, str(window)])}]")
             )
         return windows[str(window)]
 

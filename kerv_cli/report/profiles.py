@@ -57,15 +57,17 @@ class NamedProfile:
 
     def check(self, tokens: int, kinds: Iterable[str] = (), setting: str = "") -> None:
         """Refuse a profile that lacks one of `kinds` or is for chunks below `tokens` tokens. Errors name `setting`."""
-        command = f"kerv bench target={self.profile.about.get('target', 'TARGET')} tokens={tokens}"
+        about = self.profile.about
+        target = about.get("target", "TARGET")
         if lacks := self.profile.lacks(kinds):
             reason = f"no cost of '{lacks[0]}'" + (f", which setting '{setting}' needs" if setting else "")
         elif self.profile.tokens < tokens:
             reason = f"its costs are for chunks of {self.profile.tokens} tokens"
             reason += f", setting '{setting}' decodes {tokens}" if setting else ""
+            target = target if about.get("random_weights") else "vla-150m"  # a policy's chunk has as many as it has
         else:
             return
-        raise UsageError(f"on={self.name}: {reason}. Measure it with '{command}'")
+        raise UsageError(f"on={self.name}: {reason}. Measure it with 'kerv bench target={target} tokens={tokens}'")
 
 
 def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfile]:

@@ -46,7 +46,7 @@ Progress = Callable[[int, int, str], None]
 
 _UNREADABLE = (OSError, EOFError, RuntimeError, KeyError, TypeError, ValueError, pickle.PickleError, zipfile.BadZipFile)
 # Optimisation settings that may change when a training resumes
-NOT_IDENTITY = ("steps", "validate_every", "init", "stored")
+NOT_IDENTITY = ("steps", "validate_every", "init")
 
 SAME_REQUEST = 2.0  # a second signal within this many seconds counts as the same request
 
@@ -248,6 +248,8 @@ def until_interrupted() -> Iterator[threading.Event]:
 def identity_of(train: TrainSettings, dataset: DemoDataset, **own: Any) -> str:
     """Return a hash of the settings and data that determine the weights after a given number of steps."""
     counted = {key: value for key, value in asdict(train).items() if key not in NOT_IDENTITY}
+    if train.stored == "float32":  # left out, so that trainings from before it counted can be resumed
+        del counted["stored"]
     counted["closed_loop"] = train.closed_loop > 0  # scores with and without success cannot be compared
     return hash_of({"train": counted, "demos": dataset.sha256, **own})
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from kerv_cli.base.config import compose, groups
-from kerv_cli.base.errors import CheckpointError
+from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.registry import ArtifactPart
 from kerv_cli.catalogue.entries import artifact_entry
 from kerv_cli.episodes.settings import RolloutSettings
@@ -16,6 +15,7 @@ from kerv_cli.lab.runs import command_to_go_on
 from kerv_cli.methods.artifacts import Artifacts, kind_of
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.drafters import TrainableDrafter
+from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.training.settings import PrepareSettings
 
@@ -43,7 +43,7 @@ def plan(settings: PrepareSettings, database: Database) -> list[Step]:
     artifacts = Artifacts(settings.results, settings.policy)
     description = artifacts.description
     description.check_autoregressive(f"policy.target={settings.policy.target}", "it needs nothing more")
-    kinds = needs(tuple(settings.methods))
+    kinds = needs(settings.methods, description)
     steps: list[Step] = []
     for kind in kinds:
         files = kind_of(kind)
@@ -57,12 +57,21 @@ def plan(settings: PrepareSettings, database: Database) -> list[Step]:
     return steps
 
 
-@functools.cache
-def needs(methods: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the kinds of artifacts that the methods need, in the order in which they must be made."""
+def needs(methods: Sequence[str], target: TargetDescription) -> tuple[str, ...]:
+    """Return the kinds of artifacts that the methods need, in the order in which they must be made.
+
+    Without `methods`, all that this target can use count: a target of FAST tokens needs no calibration.
+    """
     kinds: set[str] = set()
     for name in methods or groups()["method"]:
-        kinds.update(Method.of(compose("rollout", [f"method={name}"], RolloutSettings)).needs)
+        method = Method.of(compose("rollout", [f"method={name}"], RolloutSettings))
+        try:
+            method.check(target)
+        except UsageError:
+            if methods:
+                raise
+        else:
+            kinds.update(method.needs)
     order = [name for kind, part in ArtifactPart.every().items() for name in (*part.needed(None), kind)]
     possible = [kind for kind in dict.fromkeys(order) if kind in kinds]
     return tuple(kind for kind in possible if kind_of(kind).command)

@@ -402,7 +402,8 @@ def continued_target(
     target = CompactTarget(replace(settings), actions, init.observation, init.words, camera)
     new, old = target.state_dict(), init.state_dict()
     kept = old.keys() if actions == init.actions else old.keys() - {"embedding.weight", "head.weight"}
-    weights = new | {name: old[name] for name in kept & new.keys()}
+    kept = {name for name in kept & new.keys() if name != "queries" or old[name].shape == new[name].shape}
+    weights = new | {name: old[name] for name in kept}
     if target.cameras:
         for view in range(len(init.encoders) - 1, len(target.encoders) - 1):
             for name, value in init.vision.state_dict().items():
