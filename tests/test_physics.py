@@ -148,9 +148,9 @@ def test_the_command_writes_profiles_without_torch(tmp_path):
     assert not re.search(r"\| +torch$", shown.stderr, re.MULTILINE)
     documents = json.loads(shown.stdout.splitlines()[-1])
     assert len(documents) == 3 * (1 + len(DEVICES))
-    profile = read_profile(tmp_path / "bench/mine-openvla-7b-profile.json")
+    profile = read_profile(tmp_path / "bench/mine-openvla-7b-share0.5-profile.json")
     assert profile.seconds("verify", 1) == pytest.approx(OPENVLA.needs("verify", 1).read / 500e9 / 0.5, rel=1e-3)
-    assert documents["mine-openvla-7b-eager"]["device_name"] == "mine"
+    assert documents["mine-openvla-7b-eager-share0.5"]["device_name"] == "mine"
 
 
 def test_the_bench_of_a_shape_that_has_no_figures_is_refused(tmp_path):

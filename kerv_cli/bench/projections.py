@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-from kerv_cli.bench.physics import DEVICES, ENGINES, ROOFLINE, SHAPES, Device, Engine, priced
+from kerv_cli.bench.physics import DEVICES, ENGINES, ROOFLINE, SHAPES, SHARE, Device, Engine, priced
 from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.episodes.cost import EXTRA_ROUND, Profile
 
@@ -56,6 +56,7 @@ def projections(settings: BenchSettings) -> Iterator[Projection]:
         floors = priced(shape, device, ROOFLINE)
         for engine in ENGINES.values():
             chosen, end = replace(engine, share=settings.share), "" if engine.name == "tuned" else f"-{engine.name}"
+            end += "" if settings.share == SHARE else f"-share{settings.share:g}"  # the usual file stays
             yield Projection(f"{name}-{shape.name}{end}", device, chosen, priced(shape, device, chosen), floors)
 
 
