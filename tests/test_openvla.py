@@ -259,6 +259,7 @@ def test_an_import_is_a_target_like_any_other(checkpoint, tmp_path):
         ({"dataset_statistics.json": {"tiny": {"action": {"q01": ["x"]}}}}, [], "damaged"),
         ({}, ["statistics=bridge"], "unknown statistics 'bridge'"),
         ({}, ["environment=metaworld"], "are of 7 DoFs, the action space has 4"),
+        ({}, ["environment=libero"], "its gripper closes with 1, OpenVLA's with 0: leave it out"),
         ({}, ["family=compact"], "others are trained"),
         ({}, ["prompt_tokens=3"], "at most 3 are taken"),
         ({"preprocessor_config.json": {"image_resize_strategy": "letterbox"}}, [], "letterbox"),

@@ -395,6 +395,12 @@ def test_messages_equal_those_of_the_official_client_byte_for_byte():
     assert unpacked(bytes.fromhex(OFFICIAL))["observation/image"].tolist() == image.tolist()
 
 
+def test_a_policy_that_reads_no_state_is_sent_none():
+    interface = Interface(images={}, state={"observation/state": []}, execute=0)
+    sent = interface.message(POINT, Observation(np.zeros(len(POINT.observation.proprioception)), np.zeros(0), "go"))
+    assert sent["observation/state"].shape == (0,)
+
+
 def test_conventions_of_grippers_and_the_order_of_an_action():
     names = ["gripper", *LIBERO.actions.names[:6]]
     answer = {"actions": np.array([[0.9, *range(6)], [0.1, *range(6)]])}

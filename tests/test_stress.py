@@ -105,6 +105,18 @@ def test_the_model_is_whole_again_at_the_next_episode(name, request):
     assert [key for key in before if after[key].tobytes() != before[key].tobytes()] == []
 
 
+@pytest.mark.bits
+def test_the_first_image_of_an_episode_shows_the_turned_lamps(insertion):
+    """MuJoCo computes a lamp's direction with the bodies' poses, which a world may leave as they were at the start."""
+    import mujoco
+
+    insertion.stress = stressing.build(StressSettings("light", 4))
+    insertion.reset(SEED)
+    first = insertion.frame()
+    mujoco.mj_forward(*insertion._drawable())
+    assert first.tobytes() == insertion.frame().tobytes()
+
+
 def test_a_push_drives_the_hand_off_for_a_tenth_of_a_second_in_one_direction():
     stress = stressing.build(StressSettings("push", 4))
     space, still = METAWORLD.actions, np.zeros(4)

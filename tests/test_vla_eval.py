@@ -183,6 +183,14 @@ def test_a_wrong_message_gets_one_line_and_the_next_one_an_answer(policy, kind, 
         assert client.act().shape == (4,)
 
 
+def test_a_task_is_known_by_its_instruction_too(policy):
+    """vla-eval's LIBERO sends the instruction as the task's name; imported demonstrations name tasks by its words."""
+    spec = spec_of("reach-v3")
+    policy.tasks |= {"pick-up-the-black-bowl": "pick-up-the-black-bowl"}
+    asked = (spec.task("reach-v3").instruction, "reach-v3", "pick up the black bowl", "something else")
+    assert list(map(policy.named, asked)) == ["reach-v3", "reach-v3", "pick-up-the-black-bowl", "something else"]
+
+
 def test_an_episode_that_never_ends_is_refused_before_it_fills_the_memory(policy, monkeypatch):
     monkeypatch.setattr(serve_vla_eval, "MOST_STEPS", 6)
     with serving(policy) as (port, _):

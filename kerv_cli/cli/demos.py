@@ -43,7 +43,7 @@ def import_demos(settings: DemosImportSettings) -> None:
 
     Examples:
         kerv demos import source=datasets/aloha name=aloha
-        kerv demos import source=datasets/libero dofs=openvla episodes=50
+        kerv demos import source=datasets/spatial dofs=openvla episodes=50
     """
     from kerv_cli.lab.runs import making
     from kerv_cli.worlds.demos.lerobot import import_lerobot

@@ -99,7 +99,7 @@ class Interface:
         for key, names in self.state.items():
             if missing := [name for name in names if name not in offered]:
                 raise UsageError(f"{spec.name} measures no {missing[0]} for {key}: it has {', '.join(offered)}")
-            message[key] = np.concatenate([np.atleast_1d(offered[name]) for name in names])
+            message[key] = np.concatenate([np.zeros(0), *(np.atleast_1d(offered[name]) for name in names)])
         return {**message, self.prompt: observation.instruction}
 
     def actions_of(self, spec: EnvironmentSpec, answer: Message) -> tuple[np.ndarray, int]:

@@ -15,6 +15,8 @@ from kerv_cli.worlds.views import frame_shape
 
 # Client's convention (setting `gripper`) -> number that means an open gripper. The negated number means closed.
 OPEN = {"signed": 1.0, "signed_inverted": -1.0}
+# Values that close and open the gripper of a policy that is of no environment of kerv's, as OpenVLA's.
+_GRIP = (0.0, 1.0)
 
 
 @dataclass
@@ -86,7 +88,7 @@ class Interface:
         """Return the policy's actions (H, D) as float64, environment units, the gripper in the client's convention."""
         values, strict = actions.astype(np.float64), self.actions.is_strict
         if self.gripper in OPEN:
-            closed, opened = self.grip or (0.0, 1.0)
+            closed, opened = self.grip or _GRIP
             is_open = (values[:, strict] - (closed + opened) / 2) * (opened - closed) > 0
             values[:, strict] = np.where(is_open, OPEN[self.gripper], -OPEN[self.gripper])
         return values

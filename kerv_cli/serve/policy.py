@@ -29,7 +29,7 @@ from kerv_cli.serve.interface import Interface
 from kerv_cli.serve.settings import ServeSettings
 from kerv_cli.targets import TargetPart
 from kerv_cli.targets.provenance import stamp
-from kerv_cli.worlds import specs
+from kerv_cli.worlds import imported_name, specs
 
 VLA_EVAL = "vla_eval"  # the protocol in which clients name the task of every episode
 # Number of decodes before a new decoder serves. First decodes are slow: they allocate memory and choose kernels.
@@ -45,6 +45,7 @@ class Policy:
 
     Attributes:
         chunk: H, number of control steps in an answer.
+        tasks: Known tasks: instruction or name -> name.
         by_task: Whether a decoder depends on the task. This is so if the method's calibrated values or drafts depend on
             the task. Then clients must name the task.
         low: Lower ends of the ranges in which the policy may act: the demonstrations' ranges plus a margin. One per
@@ -73,8 +74,11 @@ class Policy:
         self.low, self.high = low - margin, high + margin
         parts = [part for kind in sorted(self.method.needs) if (part := ArtifactPart.find(kind)).by_task]
         self.by_task, task = not self.task and bool(parts), self.task
+        self.tasks = {one.instruction: one.name for one in spec.tasks.values()} if spec else {}
         if self.by_task and settings.protocol == VLA_EVAL:  # warm up with any task for which the method was calibrated
-            task = next(iter(self.artifacts.load(parts[0].name).tasks), "")
+            known = self.artifacts.load(parts[0].name).tasks
+            self.tasks |= {name: name for name in known}
+            task = next(iter(known), "")
         elif self.by_task and any(part.needs_task for part in parts):
             raise UsageError(
                 f"method={settings.method}: its calibration or drafts differ between tasks: name one with task=NAME"
@@ -84,6 +88,11 @@ class Policy:
         first = self.lend_decoder(task)
         self.chunk = first.steps
         self.take_back(first)
+
+    def named(self, task: str) -> str:
+        """Return a task's name. vla-eval's LIBERO sends the task's instruction instead."""
+        name = imported_name(task)
+        return self.tasks.get(task, name if name in self.tasks else task)
 
     def lend_decoder(self, task: str) -> Decoder:
         """Return a decoder for a new client: one that another client gave back, or a new one, warmed up."""
@@ -190,6 +199,7 @@ class Conversation(abc.ABC):
         Args:
             hand: (3,) position of the end effector in metres.
         """
+        task = self.policy.named(task)
         if self.policy.by_task and (self.decoder is None or task != self.task):
             self.decoder, self.task = self.policy.lend_decoder(task), task
         self.decoder.reset(self.task or task, seed, hand)

@@ -6,6 +6,7 @@ environment's specification, and the simulator when a world is opened.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
@@ -76,6 +77,11 @@ def resolve_tasks(names: Sequence[str]) -> tuple[str, ...]:
 def stands_for_tasks(name: str) -> bool:
     """Return whether `name` is a task or suite in small letters, as default names of demonstrations are."""
     return name == name.lower() and any(spec.expand(name) for spec in specs().values())
+
+
+def imported_name(instruction: str) -> str:
+    """Return the name of a task of imported data: the words of its instruction, joined by hyphens."""
+    return re.sub(r"[^a-z0-9]+", "-", instruction.lower()).strip("-")[:60]
 
 
 def task_names() -> list[str]:

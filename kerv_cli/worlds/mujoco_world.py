@@ -7,6 +7,7 @@ exist in one process. The module also finds an OpenGL backend that works on this
 from __future__ import annotations
 
 import atexit
+import copy
 import functools
 import os
 import subprocess
@@ -45,7 +46,7 @@ class MujocoWorld(World):
 
     @abstractmethod
     def _drawable(self) -> tuple[Model, Any]:
-        """Return the model (MjModel), and its data (MjData) with all poses up to date."""
+        """Return the model (MjModel), and its data (MjData). Before the first step its poses need not be up to date."""
 
     def reset(self, seed: int) -> Observation:
         self._changes.close()
@@ -55,6 +56,13 @@ class MujocoWorld(World):
 
     def _draw(self, camera: CameraSettings) -> NDArray[np.uint8]:
         model, data = self._drawable()
+        if self.steps == 0:
+            # Until the first step poses can be stale (window-close: the window is off by 0.2 m), and lamps that a stress
+            # has turned. They are computed in a copy: physics must not depend on whether a frame is drawn.
+            import mujoco
+
+            data = copy.copy(data)
+            mujoco.mj_forward(model, data)
         if camera not in self._cameras:
             self._cameras[camera] = Camera(model, camera, camera.name in self.spec.upside_down)
         return self._cameras[camera].render(data)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 SHAPES = "vision_shapes"  # shape of each vision tower; published checkpoints lack it
 CONFIG, STATISTICS = "config.json", "dataset_statistics.json"
 DOFS = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
+GRIP = (0.0, 1.0)  # values of the gripper's DoF that close and open it, as in `EnvironmentSpec.grip`
 
 
 @dataclass(frozen=True)

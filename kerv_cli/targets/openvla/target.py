@@ -28,7 +28,7 @@ from kerv_cli.engine.draft import upload
 from kerv_cli.engine.protocol import Seen
 from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.checkpoint import FORMAT, TargetDescription, target_fields
-from kerv_cli.targets.openvla.config import action_space, read_shape, read_statistics
+from kerv_cli.targets.openvla.config import DOFS, GRIP, action_space, read_shape, read_statistics
 from kerv_cli.targets.openvla.inputs import Prompter, pixels_of, read_normalisations
 from kerv_cli.targets.openvla.loading import check_finite, digest_of, load_model, open_checked, open_shards
 from kerv_cli.targets.provenance import provenance_of
@@ -144,6 +144,11 @@ def import_checkpoint(settings: BuildTargetSettings, folder: Path) -> dict[str, 
     source = Path(settings.checkpoint).expanduser().resolve()
     shape = read_shape(source)
     spec = None if settings.environment is None else EnvironmentPart.find(settings.environment).built()
+    if spec is not None and spec.actions.dofs == len(DOFS) and spec.grip not in ((), GRIP):
+        raise UsageError(
+            f"environment={spec.name}: its gripper closes with {spec.grip[0]:g}, OpenVLA's with {GRIP[0]:g}: leave it "
+            "out, and let kerv serve convert, with gripper=signed_inverted"
+        )
     statistics, bounds = read_statistics(source, settings.statistics)
     actions = action_space(shape, bounds, spec.actions if spec else None, settings.control_hz)
     prompt = Prompter(source, shape, settings.prompt_tokens).ids("move")

@@ -11,7 +11,6 @@ import contextlib
 import io
 import itertools
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from operator import itemgetter
@@ -26,7 +25,7 @@ from PIL import Image
 from kerv_cli.base.errors import CheckpointError, KervError, UnknownName, UsageError
 from kerv_cli.base.files import read_mapping, write_folder, write_json
 from kerv_cli.base.spaces import ActionSpace, Group, ObservationSpace, action_limits
-from kerv_cli.worlds import EnvironmentPart
+from kerv_cli.worlds import EnvironmentPart, imported_name
 from kerv_cli.worlds.demos.dataset import FORMAT, DemoDataset, EpisodeEntry, OnProgress, check_recorded, totals
 from kerv_cli.worlds.demos.files import DemoEpisode, foreign_table
 from kerv_cli.worlds.settings import DemosImportSettings
@@ -280,7 +279,7 @@ def _task_names(tasks: Mapping[int, str], world: EnvironmentSpec | None) -> dict
         return {number: known[text] for number, text in tasks.items()}
     names, taken = dict[int, str](), set[str]()
     for number, text in tasks.items():
-        name = re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60] or f"task-{number}"
+        name = imported_name(text) or f"task-{number}"
         names[number] = name if name not in taken else f"{name}-{number}"
         taken.add(names[number])
     return names

@@ -7,7 +7,6 @@ benchmark `MT1(task, s // 50)`.
 
 from __future__ import annotations
 
-import copy
 import functools
 import pickle
 import warnings
@@ -66,15 +65,7 @@ class MetaWorld(MujocoWorld):
         return np.array(state, dtype=np.float64), bool(info["success"])
 
     def _drawable(self) -> tuple[Any, Any]:
-        # After a reset the bodies' poses are stale in some tasks (window-close: the window is off by 0.2 m) until the
-        # first step. They are recomputed in a copy, because the physics must not depend on whether a frame is drawn.
-        model, data = self._env.model, self._env.data
-        if self.steps == 0:
-            import mujoco
-
-            data = copy.copy(data)
-            mujoco.mj_forward(model, data)
-        return model, data
+        return self._env.model, self._env.data
 
     def close(self) -> None:
         super().close()
