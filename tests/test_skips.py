@@ -277,12 +277,14 @@ def test_a_rejected_draft_near_enough_on_its_own_path_agrees(bins, agrees):
     assert modes(decoder_of(source, target, tolerance=0.0), 2) == "vv"
 
 
+@pytest.mark.parametrize("which", [0, -1])
 @torch.inference_mode()
-def test_a_flipped_strict_dof_never_agrees():
+def test_a_flipped_strict_dof_never_agrees(which):
+    """The last one is the chunk's last token, which no draft contains."""
     target = MockTarget()
     source = near(target)
     strict = np.flatnonzero(target.actions.strict_tokens(len(source.drafted)))
-    source.drafted[int(strict[0])] = (source.drafted[int(strict[0])] + 1) % target.actions.tokens
+    source.drafted[int(strict[which])] = (source.drafted[int(strict[which])] + 1) % target.actions.tokens
     assert modes(decoder_of(source, target, tolerance=2.0), 2) == "vv"
 
 

@@ -194,17 +194,17 @@ class Chunk:
     def targets_along(self, chain: Sequence[int]) -> list[int] | None:
         """Return the target's predictions along a chain of the prefill draft. Call this in the prefill's round only.
 
-        Returns N − 1 or N tokens. None if the prefill verified fewer than N − 1 tokens of this chain.
+        Returns N tokens; the last follows the draft's N − 1. None if the prefill verified fewer tokens of this chain.
         """
         tree, target_tokens, _ = self.judged
         nodes = {pair: node for node, pair in enumerate(zip(tree.parents, tree.tokens, strict=True))}
         node, targets = ROOT, list[int]()
         for token in chain:
+            targets.append(target_tokens[node + 1])
             if (node, token) not in nodes:
                 break
-            targets.append(target_tokens[node + 1])
             node = nodes[node, token]
-        return targets if len(targets) >= self.size - 1 else None
+        return targets if len(targets) == self.size else None
 
     @cached_property
     def variability(self) -> float | None:

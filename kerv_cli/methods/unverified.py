@@ -105,9 +105,10 @@ class StreakSkip(Skip):
     def verified(self, chunk: Chunk) -> None:
         targets, tolerance, agrees = chunk.targets_along(self.chain), self.settings.tolerance, False
         if targets is not None:
-            accepted = chunk.rounds[0].drafted[: chunk.rounds[0].accepted]
-            whole = accepted == self.chain[: len(targets)]
-            agrees = whole or (tolerance > 0 and chunk.distance(self.chain[: len(targets)], targets) <= tolerance)
+            # the draft leaves out the chunk's last token, such as a gripper, which is judged here
+            accepted, last = chunk.rounds[0].drafted[: chunk.rounds[0].accepted], abs(self.chain[-1] - targets[-1])
+            whole = accepted == self.chain[:-1] and last <= chunk.limits[-1]
+            agrees = whole or (tolerance > 0 and chunk.distance(self.chain, targets) <= tolerance)
         self.allowed = self.left = min(self.settings.most, 2 * self.allowed or 1) if agrees else 0
 
 
