@@ -52,6 +52,11 @@ def test_a_recorded_decode_becomes_its_forwards():
     assert found.needs == ["encode", "prefill", "verify", "feed", "draft"]
 
 
+def test_a_drafter_reads_no_states_if_one_token_is_left():
+    found = work(PREFILL, ("verify", 1, 14, 13, "drafter"), ("decode", 15, 0, 0, "none"))
+    assert found.calls["feed"].rows.tolist() == [0]
+
+
 def test_early_and_retrieved_drafts_have_costs_and_others_take_what_was_recorded():
     jacobi = work(PREFILL, ("verify", 1, 12, 12, "jacobi"))
     assert jacobi.propose.tolist() == [0.5]

@@ -155,7 +155,9 @@ def work_of(rounds: Columns, counts: np.ndarray, phases: Columns, looked_up: np.
     levels = rounds["levels"]
     trees = drafts & (levels > 0)
     forward, prefill = mode != "skip", start == 0
-    feeds = forward & has_drafter[decode] & (np.diff(decode, append=decodes) == 0)  # not after the last round
+    # the drafter reads a round's states only if another draft can follow: two or more tokens are left
+    is_last, following = np.diff(decode, append=decodes) != 0, np.append(start[1:], 0)
+    feeds = forward & has_drafter[decode] & ~is_last & (size - following > 1)
 
     def calls(chosen: np.ndarray, rows: np.ndarray, with_prompt: np.ndarray | bool = False) -> Calls:
         return Calls(decode[chosen], rows[chosen], np.broadcast_to(with_prompt, rows.shape)[chosen])
