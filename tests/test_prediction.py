@@ -79,6 +79,14 @@ def test_assembly_for_every_position(known, min_verified):
     assert np.isfinite(actions).all()
 
 
+@pytest.mark.parametrize("hold_strict", [True, False])
+def test_a_drafts_gripper_fills_a_step_unless_strict_dofs_are_held(hold_strict):
+    settings = CompensateSettings(hold_strict=hold_strict, min_verified=0)
+    actions = assemble([10], chunk_with(PAST), HOLD, settings, drafted=[20, 30, 5])
+    assert actions is not None
+    assert actions[0, 3] == (1.0 if hold_strict else float(SPACE.values_of(np.array(5))))
+
+
 def test_further_steps_are_predicted_from_the_accepted_prefix():
     settings = CompensateSettings(steps=3)
     tokens = [127, 127, 127, 254, 150]

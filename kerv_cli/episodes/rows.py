@@ -48,9 +48,10 @@ def _columns(*names: str, kind: pa.DataType = INT, read: Callable[[str], Any] = 
     return {as_.format(name): (kind, read(name)) for name in names}
 
 
-def _looks_up(one: Round) -> bool:
-    part = ProposerPart.every().get(one.proposer)
-    return part is not None and part.looks_up
+def _retrieved(decode: DecodeRecord) -> bool:
+    # a merged draft without the early drafter has its sources' names
+    names = {name for one in decode.rounds for name in one.proposer.split("+")}
+    return any(part.looks_up for name, part in ProposerPart.every().items() if name in names)
 
 
 def _executed(episode: EpisodeRecord, count: Callable[[DecodeRecord, int, int], int]) -> int:
@@ -83,7 +84,7 @@ _EPISODE: Fields = {
     "skipped_decodes": (INT, _summed(lambda decode: decode.skipped)),
     "unverified_tokens": (INT, lambda episode: _executed(episode, DecodeRecord.unverified_among)),
     "executed_tokens": (INT, lambda episode: _executed(episode, _values)),  # control steps × DoFs
-    "retrieval_decodes": (INT, _summed(lambda decode: any(map(_looks_up, decode.rounds)))),
+    "retrieval_decodes": (INT, _summed(_retrieved)),
     "deviation_sum": (FLOAT, _summed(lambda decode: decode.deviation)),  # normalised action units, over sampled decodes
     "deviation_count": (INT, _summed(lambda decode: decode.deviation is not None)),
     "delay_decodes": (INT, _summed(lambda decode: decode.delay is not None)),  # during which the world went on

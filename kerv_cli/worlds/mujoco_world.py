@@ -57,8 +57,8 @@ class MujocoWorld(World):
     def _draw(self, camera: CameraSettings) -> NDArray[np.uint8]:
         model, data = self._drawable()
         if self.steps == 0:
-            # Until the first step poses can be stale (window-close: the window is off by 0.2 m), and lamps that a stress
-            # has turned. They are computed in a copy: physics must not depend on whether a frame is drawn.
+            # Until the first step poses can be stale (window-close: the window is off by 0.2 m), and turned lamps are.
+            # They are computed in a copy: physics must not depend on whether a frame is drawn.
             import mujoco
 
             data = copy.copy(data)

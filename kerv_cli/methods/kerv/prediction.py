@@ -229,7 +229,8 @@ def assemble(
     flat[: len(values)] = values
     actions: np.ndarray = flat.reshape(steps, dofs)
     history = chunk.episode.history(actions[:whole])
-    if len(history):  # strict DoFs keep their last value; if there is none, they take the draft's tokens
+    # strict DoFs keep their last value; if there is none, they take the draft's tokens
+    if len(history) and settings.hold_strict:
         flat[len(tokens) :][chunk.space.strict_tokens(flat.size)[len(tokens) :]] = np.nan
     if np.isnan(actions).any():
         predicted = predictor.predict(history, steps - whole)
