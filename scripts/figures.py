@@ -69,7 +69,8 @@ def _largest(acceptance: Mapping[str, list[float | None]]) -> float | None:
 def publish(studies: list[str]) -> None:
     """Copy the tables of `kerv report` to where they are committed."""
     for study in studies:
-        found = [path for path in WRITTEN.glob(f"{study}*") if path.name.removeprefix(study)[:1] in (".", "_")]
+        parts = re.compile(rf"{re.escape(study)}(_against_\w+)?(_per_task|_on)?\.(csv|json)")
+        found = [path for path in WRITTEN.glob(f"{study}*") if parts.fullmatch(path.name)]
         if not found:
             raise BadReference(f"no table of {study} in {WRITTEN}: kerv report study={study}")
         for path in found:

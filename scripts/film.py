@@ -16,7 +16,7 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
-from kerv_cli.board.episode import record_episode
+from kerv_cli.board.recorder import record_episode
 from kerv_cli.catalogue.episodes import find_episode, outcomes
 from kerv_cli.lab.database import opened
 from kerv_cli.lab.store import Study, loaded
@@ -58,8 +58,7 @@ def read_panel(store: Study, label: str, task: str, seed: int) -> Panel:
     (row,) = [one for one in outcomes(store, task, seed) if one.label == label and one.episode is not None]
     found = find_episode(store.database, row.episode)
     if not found.recording.exists():
-        results = str(store.database.results)
-        error = record_episode(found.episode.setting, task, [*found.earlier, seed], results, found.recording)
+        error = record_episode(found)
         if error:
             raise SystemExit(error)
     decodes, starts = found.decodes()

@@ -170,6 +170,14 @@ def test_no_acceptance_is_taken_from_other_chunks_and_no_ceiling_beats_one_forwa
     assert all(one["method"] in {draft.method for draft in DRAFTS} for one in shown.values())
 
 
+def test_the_papers_loop_costs_a_draft_a_round_too_many_as_it_costs_ar_a_forward():
+    (engine,) = machine("on=a100-openvla-7b-public", "tokens=7", "accepted=[0,1]")["engines"]
+    assert sum(part["ms"] for part in engine["parts"]) == pytest.approx(engine["ms"])
+    speeds = {one["method"]: one["speeds"] for one in engine["drafts"]}
+    assert speeds["last_action"]["0"] < 1.001  # nothing is gained if nothing is accepted
+    assert speeds["last_action"]["1"] > 2  # the prefill ends the decode, and no round follows
+
+
 def test_what_is_recommended_does_not_change_the_policy():
     """Row 5 of the review: `one_pass` was named, which relaxes what is accepted."""
     from kerv_cli.base.config import compose

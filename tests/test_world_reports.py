@@ -2,6 +2,7 @@
 
 import dataclasses
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from studies_synthetic import episode, points_of, settings_of, study_of, swept
@@ -13,7 +14,7 @@ from kerv_cli.lab.work import RunEpisode
 from kerv_cli.report.plots import study_figures
 from kerv_cli.report.statistics import PairedCounts
 from kerv_cli.report.summary import summary
-from kerv_cli.report.tables import load_study
+from kerv_cli.report.tables import StudyData, load_study
 from kerv_cli.report.verdict import verdict_of
 from kerv_cli.worlds.settings import StressSettings
 
@@ -45,6 +46,18 @@ def stressed(tmp_path_factory):
     """The data of a study of stressed worlds."""
     study = study_of(stressed_settings(), TASKS, "stress", title="", axis="")
     return load_study(swept(tmp_path_factory.mktemp("stress"), study, run_stressed)[0])
+
+
+def test_a_line_of_a_chart_joins_the_stress_levels_of_one_clock():
+    settings = {}
+    for level in (0, 2):
+        for clock in ("waits", "real"):
+            settings[f"{clock} {level}"] = settings_of("ar")
+            settings[f"{clock} {level}"].rollout.clock = clock
+            settings[f"{clock} {level}"].world.stress = StressSettings("push" if level else "none", level)
+    data = SimpleNamespace(study=study_of(settings, TASKS, "clocks"))
+    found = StudyData.unstressed.func(data)
+    assert found == {label: f"{label.split()[0]} 0" for label in settings}
 
 
 def test_a_stressed_setting_is_compared_with_the_baseline_under_the_same_stress(stressed):

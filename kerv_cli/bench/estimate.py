@@ -14,7 +14,7 @@ import numpy as np
 from kerv_cli.base.errors import UsageError
 from kerv_cli.bench.physics import DEVICES, ENGINES, INSTRUCTION, SHAPES, Shape, encoder_of_weights, priced, vla_shape
 from kerv_cli.bench.settings import EstimateSettings
-from kerv_cli.episodes.cost import Profile
+from kerv_cli.episodes.cost import EXTRA_ROUND, Profile
 from kerv_cli.report.profiles import NamedProfile, open_profiles
 from kerv_cli.targets.openvla.config import TOWERS, Language
 
@@ -45,23 +45,28 @@ class Draft:
         After a rejection, the drafter drafts again. Without a drafter, the target decodes the rest alone.
         """
         cost = functools.cache(profile.seconds)
-        after = [0.0] * (tokens + 1)  # of the rest of a decode, by the number of committed tokens
+        # by the number of committed tokens: of the rest of a decode, and of its next round alone
+        after, alone = [0.0] * (tokens + 1), [0.0] * (tokens + 1)
 
-        def forward(kind: str, rows: int, depth: int, start: int) -> float:
+        def forward(kind: str, rows: int, depth: int, start: int, rest: Sequence[float]) -> float:
             total, reached = cost(kind, rows), 1.0
             for accepted in range(depth + 1):
                 ends = reached * (1 - chance) if accepted < depth else reached
                 stop, read = start + accepted + 1, accepted + (1 if start else profile.prompt)
-                fed = cost("feed", read) if self.chain and stop < tokens else 0.0
-                total, reached = total + ends * (fed + after[stop]), reached * chance
+                fed = cost("feed", read) if self.chain and tokens - stop > 1 else 0.0
+                total, reached = total + ends * (fed + rest[stop]), reached * chance
             return total
 
         for start in range(tokens - 1, 0, -1):
             depth = min(self.chain, tokens - start - 1)
-            after[start] = forward("verify", 1 + depth, depth, start) + (cost("draft", depth) if depth else 0.0)
+            drafting, nothing = cost("draft", depth) if depth else 0.0, [0.0] * (tokens + 1)
+            alone[start] = drafting + forward("verify", 1 + depth, depth, start, nothing)
+            after[start] = drafting + forward("verify", 1 + depth, depth, start, after)
         whole = 0 if self.chain else tokens - 1
         first = cost("encode", 1) + (cost(self.source, 1) if self.source else 0.0)
-        return first + forward("prefill", profile.prompt + whole, whole, 0)
+        if profile.about.get(EXTRA_ROUND):  # as `prices` does: the round after the prefill runs once more
+            after = [sum(pair) for pair in zip(after, alone, strict=True)]
+        return first + forward("prefill", profile.prompt + whole, whole, 0, after)
 
 
 DRAFTS = (Draft("last_action"), Draft("one_pass_strict", source="early"), Draft("naive_sd", chain=5))
@@ -141,6 +146,7 @@ def engine_of(costs: NamedProfile, tokens: int, acceptance: Sequence[float]) -> 
         ("vision encoder", "encode", profile.seconds("encode", 1)),
         (f"prefill, {profile.prompt} tokens", "prefill", profile.seconds("prefill", profile.prompt)),
         (f"{tokens - 1} further tokens", "verify", (tokens - 1) * profile.seconds("verify", 1)),
+        *([("a forward too many", "verify", profile.seconds("verify", 1))] if profile.about.get(EXTRA_ROUND) else []),
     ):
         parts.append({"part": part, "ms": 1e3 * seconds, "bound": costs.bounds.get(kind, "measured")})
     alone, drafts = profile.decode(tokens), []

@@ -18,9 +18,10 @@ from starlette.routing import Route
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.board.pages import database_of, refreshed, render
 from kerv_cli.catalogue.entries import RunEntry, children, description_of, disk_bytes, find_run, find_runs, parents
+from kerv_cli.episodes.identity import hash_of
 from kerv_cli.lab.database import Database
 from kerv_cli.lab.runs import RUNNING, run_rows
-from kerv_cli.lab.store import Study, counts_of, loaded, version_of
+from kerv_cli.lab.store import ABOUT, Study, counts_of, loaded, version_of
 from kerv_cli.report.tables import flatten
 
 # Choice of the filter by state -> whether a run is shown
@@ -125,7 +126,10 @@ def show_tables(request: Request) -> Response:
     database, name = database_of(request), request.path_params["name"]
     store = loaded(Study(database, name), episodes=False)
     is_running = RUNNING in map(attrgetter("status"), run_rows(database, store.kind, name))
-    version = f"{version_of(store)}/{is_running}"
+    # what a report shows besides episodes: how the study is described, and profiles by which its decodes are priced
+    profiles = {path.name: path.stat().st_mtime for path in (database.results / "bench").glob("*.json")}
+    described = [getattr(store, name) for name in ABOUT], [one.work for one in store.settings], sorted(profiles.items())
+    version = f"{version_of(store)}/{is_running}/{hash_of(described)[:12]}"
     if request.query_params.get("known") == version:
         return Response(status_code=204)
     has_episodes = counts_of(store)[0] > 0

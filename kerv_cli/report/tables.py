@@ -105,10 +105,13 @@ class StudyData:
 
         If the study lacks that setting, it is the first one that differs only in stress and `rollout.*`.
         """
-        first, found = dict[str, str](), {}
+        first, same, found = dict[str, str](), dict[str, str](), {}
         for setting in sorted(self.study.settings, key=lambda one: stress_of(one.settings)["level"] > 0):
-            same = first.setdefault(_methods_of(setting), setting.label)
-            found[setting.label] = same if stress_of(setting.settings)["level"] else setting.label
+            methods, is_stressed = _methods_of(setting), stress_of(setting.settings)["level"] > 0
+            clock = json.dumps([methods, setting.settings["rollout"]], sort_keys=True)
+            usual = first.setdefault(methods, setting.label)
+            same |= {} if is_stressed else {clock: setting.label}
+            found[setting.label] = same.get(clock, usual) if is_stressed else setting.label
         return found
 
     @functools.cached_property
@@ -146,7 +149,8 @@ class StudyData:
             for first in range(0, len(numbers), _AT_ONCE):
                 decodes = decodes_of(self.study, numbers[first : first + _AT_ONCE], READ)
                 tally += Tally.of_rounds(decodes["rounds"].combine_chunks().flatten())
-            tallies[label] = tally
+            if tally.drafts:  # a server counts its verifications, but sends no rounds
+                tallies[label] = tally
         return tallies
 
     @functools.cached_property
