@@ -29,7 +29,7 @@ from kerv_cli.engine.chunk import Chunk, Follower
 from kerv_cli.engine.decoder import Decoder
 from kerv_cli.engine.record import Round, variability
 from kerv_cli.lab.database import Database
-from kerv_cli.methods.artifacts import MadeFor
+from kerv_cli.methods.artifacts import Artifacts, MadeFor
 from kerv_cli.methods.calibration import (
     NEVER,
     BoundarySection,
@@ -242,6 +242,8 @@ def test_a_run_writes_what_the_next_session_reads(results, target):
     assert loaded.demos.sha256 == DemoDataset.open(results / "artifacts/demos/few").sha256
     assert loaded.boundary.episodes == 12
     assert loaded.skip is None
+    drafter = Artifacts(str(results), PolicySettings(target=target)).check(["drafter"])["drafter"]
+    assert CalibrationArtifact().sources(loaded) == {"drafter": drafter}  # another drafter's K_S would be another
     assert [line.split(":")[0] for line in notes] == ["no skip levels"]
     for kind, predictor_class in PREDICTORS.items():
         predictor = predictor_class(SPACE.is_strict, loaded.noise.get(kind), window=loaded.window)

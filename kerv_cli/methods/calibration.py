@@ -99,6 +99,7 @@ class Calibration:
     """Contents of `calibration.json` (docs/formats.md). A section that was not measured is None or empty.
 
     `window` is the number of past actions that a predictor reads. The key of `noise` is `kalman`, the filter's name.
+    `drafter` is the hash of the drafter on whose drafts `variability` was measured. Empty if unknown.
     """
 
     target: MadeFor
@@ -108,6 +109,7 @@ class Calibration:
     variability: dict[str, Variability]
     boundary: BoundarySection | None = None
     skip: SkipSection | None = None
+    drafter: str = ""
     provenance: dict[str, Any] = field(default_factory=dict)
     format: Literal[2] = 2
     kind: Literal["calibration"] = "calibration"
@@ -177,7 +179,8 @@ class CalibrationArtifact(Artifact[Calibration]):
         return path
 
     def sources(self, description: Calibration) -> Mapping[str, str]:
-        return {"datastore": description.skip.datastore} if description.skip else {}
+        stored = {"datastore": description.skip.datastore if description.skip else "", "drafter": description.drafter}
+        return {kind: digest for kind, digest in stored.items() if digest}
 
     def check_use(self, description: Calibration, use: Use) -> None:
         threshold, boundary = use.method["threshold"], use.method["boundary"]

@@ -75,7 +75,7 @@ def plan_calibration(settings: CalibrateSettings, database: Database) -> Plan[Ca
     chosen = choose_episodes(dataset, tasks, settings.episodes)
     drafting().check(target)
     missing = [kind for kind in ("drafter", "datastore") if not artifacts.exists(kind)]
-    artifacts.check({"datastore"} - set(missing))
+    hashes = artifacts.check({"drafter", "datastore"} - set(missing))
     path = artifacts.new("calibration")
     check = partial(check_free, path, "policy.artifacts.calibration", settings.replace)
     without = f"; without {' and '.join(missing)}" if missing else ""
@@ -112,6 +112,7 @@ def plan_calibration(settings: CalibrateSettings, database: Database) -> Plan[Ca
             variability=variability,
             boundary=boundary,
             skip=skip,
+            drafter=hashes["drafter"] if measures_k else "",
             provenance=provenance_of("kerv calibrate", settings, device),
         )
         write_json(path, stamped(asdict(calibration)))
