@@ -4,13 +4,17 @@ import dataclasses
 from dataclasses import replace
 from types import SimpleNamespace
 
+import pandas as pd
+import pyarrow as pa
 import pytest
 from studies_synthetic import episode, points_of, settings_of, study_of, swept
 
 from kerv_cli.engine.record import Delay
 from kerv_cli.episodes.identity import Setting, stress_of
+from kerv_cli.episodes.rows import DECODE_SCHEMA
 from kerv_cli.episodes.settings import RolloutSettings, TimingSettings
 from kerv_cli.lab.work import RunEpisode
+from kerv_cli.report import tables as report_tables
 from kerv_cli.report.plots import study_figures
 from kerv_cli.report.statistics import PairedCounts
 from kerv_cli.report.summary import summary
@@ -46,6 +50,15 @@ def stressed(tmp_path_factory):
     """The data of a study of stressed worlds."""
     study = study_of(stressed_settings(), TASKS, "stress", title="", axis="")
     return load_study(swept(tmp_path_factory.mktemp("stress"), study, run_stressed)[0])
+
+
+def test_a_served_policy_whose_rounds_nobody_sent_has_no_acceptance_by_place(monkeypatch):
+    """Its server counts verifications, so `verifications` is above 0."""
+    rounds = pa.array([[], []], DECODE_SCHEMA.field("rounds").type)
+    monkeypatch.setattr(report_tables, "decodes_of", lambda *_: pa.table({"rounds": rounds}))
+    episodes = pd.DataFrame({"label": ["far"], "verifications": [7], "seed": [1], "episode": [1]})
+    data = SimpleNamespace(labels=["far"], episodes=episodes, study=None)
+    assert StudyData.tallies.func(data) == {}
 
 
 def test_a_line_of_a_chart_joins_the_stress_levels_of_one_clock():
