@@ -18,7 +18,7 @@ from kerv_cli.base.limits import check_settings
 
 T = TypeVar("T")
 
-DIGEST = "digest"  # field of a JSON file with the SHA-256 of all its other fields, sorted by name, as compact JSON
+DIGEST = "digest"  # field of a JSON file with the SHA-256 of all its other fields, sorted by name, as JSON
 
 
 def read(kind: type[T], value: Any, what: str, tolerant: bool = False) -> T:

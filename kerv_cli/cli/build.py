@@ -1,4 +1,4 @@
-"""`kerv build target`, `drafter` and `datastore`."""
+"""`kerv build target` and `datastore`."""
 
 from __future__ import annotations
 
