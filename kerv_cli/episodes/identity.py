@@ -19,7 +19,8 @@ from kerv_cli.episodes.settings import RolloutSettings
 # Version of the decoding. Increase it with every change of the code that alters tokens or actions.
 # tests/test_golden.py checks this.
 # 2: a streak compares the first source's draft on its own path, and the filter of KERV's code waits for four actions.
-ENGINE = 2
+# 3: a streak judges the chunk's last token, and `hold_strict=false` releases drafted strict DoFs.
+ENGINE = 3
 
 Plain = Mapping[str, Any]  # a rollout's settings as nested dictionaries, lists and plain values, as they are stored
 
