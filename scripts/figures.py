@@ -9,8 +9,8 @@ committed.
 
 A study's name is that of `results/tables/<study>.csv`. Behind it `only=a,b` takes these settings, which are written
 with `_` for a space. A column `NAME@OTHER`
-is that of the same setting in the table OTHER.csv, or priced for the machine OTHER, from `<study>_on.csv`. Behind a
-column, `=TITLE` is its heading, with `_` for a space.
+is that of the same setting in the table OTHER.csv, or priced for the machine OTHER, from `<study>_on.csv`, or for
+TABLE:MACHINE from `TABLE_on.csv`. Behind a column, `=TITLE` is its heading, with `_` for a space.
 """
 
 from __future__ import annotations
@@ -166,8 +166,9 @@ def _column(name: str, study: str = "") -> tuple[str, Callable[[Row], str]]:
     if (TABLES / f"{other}.csv").is_file():
         there, title, mark = table_of(other), f"{title}, {other}", ""
     else:
-        there = tuple(row for row in table_of(f"{study}_on") if row["on"] == other)
-        title, mark = f"{title}, ≈ {other}", "≈ "
+        table, _, machine = other.rpartition(":")
+        there = tuple(row for row in table_of(f"{table or study}_on") if row["on"] == machine)
+        title, mark = f"{title}, ≈ {machine}", "≈ "
     rows = {row["label"]: row for row in there}
     if not rows:
         raise BadReference(f"{study}_on has no machine {other}")

@@ -67,7 +67,8 @@ class NamedProfile:
             target = target if about.get("random_weights") else "vla-150m"  # a policy's chunk has as many as it has
         else:
             return
-        raise UsageError(f"on={self.name}: {reason}. Measure it with 'kerv bench target={target} tokens={tokens}'")
+        command = f"kerv bench target={target} tokens={tokens}"
+        raise UsageError(f"on={self.name}: {reason}. Measure it with '{command}'")
 
 
 def open_profiles(results: Path | str, names: Iterable[str]) -> list[NamedProfile]:
