@@ -8,9 +8,9 @@ committed.
     <!-- figure main one_pass speedup -->2.04 (1.97–2.11)<!-- /figure -->      one number within a sentence
 
 A study's name is that of `results/tables/<study>.csv`. Behind it `only=a,b` takes these settings, which are written
-with `_` for a space. A column `NAME@OTHER`
-is that of the same setting in the table OTHER.csv, or priced for the machine OTHER, from `<study>_on.csv`, or for
-TABLE:MACHINE from `TABLE_on.csv`. Behind a column, `=TITLE` is its heading, with `_` for a space.
+with `_` for a space. A column `NAME@OTHER` is that of the same setting elsewhere. OTHER is a table, OTHER.csv, or a
+machine, for which `<study>_on.csv` has prices, or TABLE:MACHINE, for which `TABLE_on.csv` has them. Behind a column,
+`=TITLE` is its heading, with `_` for a space.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ def _column(name: str, study: str = "") -> tuple[str, Callable[[Row], str]]:
         title, mark = f"{title}, ≈ {machine}", "≈ "
     rows = {row["label"]: row for row in there}
     if not rows:
-        raise BadReference(f"{study}_on has no machine {other}")
+        raise BadReference(f"no table has the machine or rows of {other}")
     return own.replace(
         "_", " "
     ) or title, lambda row: f"{mark}{text(rows[row['label']])}" if row["label"] in rows else ""

@@ -46,7 +46,7 @@ class Draft:
         """
         cost = functools.cache(profile.seconds)
         # by the number of committed tokens: of the rest of a decode, and of its next round alone
-        after, alone = [0.0] * (tokens + 1), [0.0] * (tokens + 1)
+        after, alone, nothing = ([0.0] * (tokens + 1) for _ in range(3))
 
         def forward(kind: str, rows: int, depth: int, start: int, rest: Sequence[float]) -> float:
             total, reached = cost(kind, rows), 1.0
@@ -59,7 +59,7 @@ class Draft:
 
         for start in range(tokens - 1, 0, -1):
             depth = min(self.chain, tokens - start - 1)
-            drafting, nothing = cost("draft", depth) if depth else 0.0, [0.0] * (tokens + 1)
+            drafting = cost("draft", depth) if depth else 0.0
             alone[start] = drafting + forward("verify", 1 + depth, depth, start, nothing)
             after[start] = drafting + forward("verify", 1 + depth, depth, start, after)
         whole = 0 if self.chain else tokens - 1

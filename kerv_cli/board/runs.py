@@ -129,7 +129,7 @@ def show_tables(request: Request) -> Response:
     # what a report shows besides episodes: how the study is described, and profiles by which its decodes are priced
     profiles = {path.name: path.stat().st_mtime for path in (database.results / "bench").glob("*.json")}
     described = [getattr(store, name) for name in ABOUT], [one.work for one in store.settings], sorted(profiles.items())
-    version = f"{version_of(store)}/{is_running}/{hash_of(described)[:12]}"
+    version = f"{version_of(store)}/{is_running}/{hash_of(described)}"
     if request.query_params.get("known") == version:
         return Response(status_code=204)
     has_episodes = counts_of(store)[0] > 0

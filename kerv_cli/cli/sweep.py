@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,7 @@ from kerv_cli.cli.studies import (
 from kerv_cli.episodes.settings import RolloutSettings, SweepSettings
 
 if TYPE_CHECKING:
+    from kerv_cli.lab.plan import Episode
     from kerv_cli.lab.store import Study
     from kerv_cli.lab.work import Outcome
     from kerv_cli.report.tables import StudyData
@@ -107,18 +109,20 @@ def _list_studies(as_json: bool) -> None:
     typer.echo("run one, e.g.: kerv sweep study=demo; what it would do: --plan")
 
 
-def tables(study: Study, outcome: Outcome) -> StudyData | None:
-    """Read the results of a sweep's episodes. Return None if no episode has ended.
-
-    The study in the database may have more tasks, from earlier sweeps. If it has not, this is what `kerv report` reads.
-    """
+def is_whole(study: Study, episodes: Sequence[Episode]) -> bool:
+    """Return whether these are all episodes of the stored study, which may have more tasks from earlier sweeps."""
     from kerv_cli.lab.store import counts_of
+
+    return len(episodes) == counts_of(study)[1]
+
+
+def tables(study: Study, outcome: Outcome) -> StudyData | None:
+    """Read the results of a sweep's episodes, of a whole study as `kerv report` does. None if no episode has ended."""
     from kerv_cli.report.tables import load_study
 
     failed = {one for failure in outcome.failed for one in failure.episodes}
     there = [one for one in study.episodes if one not in failed]
-    is_whole = len(there) == counts_of(study)[1]
-    return load_study(study, None if is_whole else there) if there else None
+    return load_study(study, None if is_whole(study, there) else there) if there else None
 
 
 def print_outcome(study: Study, outcome: Outcome, data: StudyData | None, as_json: bool) -> None:
@@ -143,13 +147,11 @@ def print_outcome(study: Study, outcome: Outcome, data: StudyData | None, as_jso
 
 def write(study: Study, outcome: Outcome, data: StudyData | None, loss: float) -> None:
     """Write the report of a complete study, and print its verdict."""
-    from kerv_cli.lab.store import counts_of
     from kerv_cli.report.report import write_study
     from kerv_cli.report.tables import load_study
 
     if data is None or outcome.failed:
         return
-    is_whole = counts_of(study)[1] == len(data.study.episodes)
-    report = write_study(data if is_whole else load_study(study), loss)
+    report = write_study(data if is_whole(study, data.study.episodes) else load_study(study), loss)
     print_prices(report.priced)
     print_verdict(report)

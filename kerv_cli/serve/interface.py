@@ -10,13 +10,12 @@ from kerv_cli.base.errors import UsageError
 from kerv_cli.base.spaces import Observation
 from kerv_cli.base.wire import LARGEST, Message
 from kerv_cli.targets.checkpoint import TargetDescription
+from kerv_cli.targets.openvla.config import GRIP
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.views import frame_shape
 
 # Client's convention (setting `gripper`) -> number that means an open gripper. The negated number means closed.
 OPEN = {"signed": 1.0, "signed_inverted": -1.0}
-# Values that close and open the gripper of a policy that is of no environment of kerv's, as OpenVLA's.
-_GRIP = (0.0, 1.0)
 
 
 @dataclass
@@ -31,8 +30,8 @@ class Interface:
         space: Action space of the environment, or of the policy if kerv does not know the environment.
         size: Side of an image in pixels. 0 if the policy reads no images.
         privileged: Whether the policy reads the whole simulator state, not only proprioception.
-        grip: The two gripper values in the environment's actions: first to close, then to open. Empty if the policy is
-            of no environment of kerv's: 0 then closes the gripper and 1 opens it, as in OpenVLA.
+        grip: The two gripper values in the environment's actions: first to close, then to open. OpenVLA's if kerv does
+            not know the environment.
     """
 
     description: TargetDescription
@@ -46,7 +45,7 @@ class Interface:
         self.size = int(policy.settings.get("image_size", 0)) if policy.cameras else 0
         self.privileged = not policy.cameras and policy.observation.state > 0
         self.space = self.spec.actions if self.spec else policy.actions
-        self.grip = self.spec.grip if self.spec else ()
+        self.grip = (self.spec.grip if self.spec else ()) or GRIP
 
     def image(self, image: object, camera: str, key: str) -> np.ndarray:
         """Check a client's image (height, width, 3) uint8, and return it. `image` may be a function that returns it."""
@@ -88,7 +87,7 @@ class Interface:
         """Return the policy's actions (H, D) as float64, environment units, the gripper in the client's convention."""
         values, strict = actions.astype(np.float64), self.actions.is_strict
         if self.gripper in OPEN:
-            closed, opened = self.grip or _GRIP
+            closed, opened = self.grip
             is_open = (values[:, strict] - (closed + opened) / 2) * (opened - closed) > 0
             values[:, strict] = np.where(is_open, OPEN[self.gripper], -OPEN[self.gripper])
         return values

@@ -48,7 +48,7 @@ def dim_specs(interface: Interface) -> dict[str, dict[str, dict[str, object]]]:
 
 
 def _gripper_format(interface: Interface) -> str:
-    closes = interface.grip[0] if interface.grip else 0.0
+    closes = interface.grip[0]
     if interface.gripper in OPEN:
         closes = -OPEN[interface.gripper]
     return {-1.0: "binary_close_negative", 1.0: "binary_close_positive"}.get(closes, "continuous_01")

@@ -229,7 +229,7 @@ def assemble(
     flat[: len(values)] = values
     actions: np.ndarray = flat.reshape(steps, dofs)
     history = chunk.episode.history(actions[:whole])
-    # strict DoFs keep their last value; if there is none, they take the draft's tokens
+    # Held DoFs keep their last value. In an episode's first step there is none, and they take the draft's tokens.
     if len(history) and settings.hold_strict:
         flat[len(tokens) :][chunk.space.strict_tokens(flat.size)[len(tokens) :]] = np.nan
     if np.isnan(actions).any():
