@@ -16,7 +16,7 @@ from flips import flipped
 
 from kerv_cli.base.errors import CheckpointError
 from kerv_cli.bench import measure as measuring
-from kerv_cli.bench.measure import Phase, costs_of, decoders, measure, profile_of
+from kerv_cli.bench.measure import Phase, costs_of, decoders, launches, measure, profile_of
 from kerv_cli.bench.model import open_model
 from kerv_cli.bench.physics import Sizes
 from kerv_cli.bench.settings import BenchSettings
@@ -227,6 +227,11 @@ def quick(monkeypatch):
 
 
 @pytest.mark.usefixtures("quick")
+def test_what_starts_work_on_a_gpu_is_counted():
+    counted = "cudaLaunchKernel", "cuLaunchKernelEx", "cudaGraphLaunch", "cudaMemcpyAsync", "cudaMemsetAsync"
+    assert launches([*counted, "aten::mm", "cudaEventRecord", "cudaDeviceSynchronize"]) == len(counted)
+
+
 def test_the_command_ends_with_one_document(tmp_path):
     words = ("target=nano", "dtype=float32", "repeats=3", "tokens=7", f"results={tmp_path}")
     told = kerv("bench", *words, "--json").stdout

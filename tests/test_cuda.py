@@ -5,6 +5,7 @@ import torch
 from flips import flipped
 
 from kerv_cli.base.settings import RuntimeSettings
+from kerv_cli.bench.measure import launches_per_token
 from kerv_cli.bench.model import open_model
 from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.decoder import Decoder, Parts
@@ -36,6 +37,7 @@ def test_strict_methods_decode_the_baselines_tokens():
     model = open_model(BenchSettings(target="nano", dtype="float32", runtime=RuntimeSettings(device="cuda")))
     autoregressive = Decoder(model.target).decode(model.observation)
     assert sum(autoregressive.phases.values()) == pytest.approx(autoregressive.seconds, rel=0.2)
+    assert launches_per_token(model) < 20
     for proposer in (JacobiProposer(JacobiProposerSettings()), DrafterProposer(model.drafter, model.target, 5, 3, 12)):
         assert Decoder(model.target, Parts(proposer=proposer)).decode(model.observation).tokens == autoregressive.tokens
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 import functools
 import logging
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -48,6 +49,7 @@ _EVICTING = 16 * 2**20  # float32 numbers that are read before each decode, to e
 _TREE = (5, 8, 50)  # depth, children, nodes of EAGLE-2's tree
 _MERGED = 30  # nodes of a merged in-prefill draft
 _TASK = "reach-v3"
+_LAUNCH = re.compile(r"cu(da)?(LaunchKernel|GraphLaunch|Memcpy|Memset)")
 Key = tuple[str, int]  # the attributes `kind` and `rows` of a `Phase`
 Lap = tuple[str, float]  # phase of a decode, as in `engine.record.PHASES`, and its seconds
 
@@ -246,7 +248,7 @@ def title_of(model: Model) -> str:
     return f"{model.name}, {dtype}, {where}, {torch.get_num_threads()} thread, caches cold at first"
 
 
-def document(model: Model, phases: Sequence[Phase]) -> dict[str, Any]:
+def document(model: Model, phases: Sequence[Phase], launched: float | None) -> dict[str, Any]:
     device = str(model.target.device)
     return {
         "target": model.name,
@@ -254,6 +256,7 @@ def document(model: Model, phases: Sequence[Phase]) -> dict[str, Any]:
         "dtype": str(model.dtype).removeprefix("torch."),
         "device": device,
         "threads": torch.get_num_threads(),
+        "launches_per_token": launched,
         **stamp(device),
         "phases": list(map(Phase.as_dict, phases)),
         "profile": profile_of(phases, model.size).as_dict(),
@@ -275,7 +278,7 @@ def measure(model: Model, settings: BenchSettings) -> list[Phase]:
             prompt = model.target.encode(model.observation)
             clock.lap("vision")
             chunk = decoder.decode_prompt(prompt, clock)
-            chunk.actions()
+            chunk.actions(chunk.values(chunk.steps))
             clock.stop()
             costs += costs_of(decoder, prompt.shape[1], chunk.rounds, clock.laps)
         for kind, source in sources.items():
@@ -286,6 +289,23 @@ def measure(model: Model, settings: BenchSettings) -> list[Phase]:
                 seconds.setdefault(key, []).append(value)
     machine = machine.best_of(measure_machine(device, model.dtype))
     return list(phases_of(seconds, model.sizes, machine))
+
+
+def launches_per_token(model: Model) -> float | None:
+    """Count the calls that start work on the GPU in one autoregressive decode, per token. None on a CPU."""
+    if model.target.device.type == "cpu":
+        return None
+    decoder, prompt = Decoder(model.target), model.target.encode(model.observation)
+    decoder.decode_prompt(prompt)  # captures the graphs
+    with torch.profiler.profile() as profiler:
+        chunk = decoder.decode_prompt(prompt)
+        torch.cuda.synchronize()
+    return launches(event.name for event in profiler.events()) / len(chunk.tokens)
+
+
+def launches(calls: Iterable[str]) -> int:
+    """Count the CUDA calls that start a kernel, a graph, a copy or a fill, by their names in a profile."""
+    return sum(bool(_LAUNCH.match(call)) for call in calls)
 
 
 def phase_rows(phases: Sequence[Phase]) -> Iterator[dict[str, str]]:

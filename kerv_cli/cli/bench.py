@@ -33,13 +33,15 @@ def bench(settings: BenchSettings, as_json: AsJson = False) -> None:
     if settings.projected != "none":
         _project(settings, as_json)
         return
-    from kerv_cli.bench.measure import document, measure, phase_rows, title_of
+    from kerv_cli.bench.measure import document, launches_per_token, measure, phase_rows, title_of
     from kerv_cli.bench.model import open_model
 
     model = open_model(settings)
-    phases = measure(model, settings)
+    phases, launched = measure(model, settings), launches_per_token(model)
     print_rows(list(phase_rows(phases)), title_of(model))
-    result = document(model, phases)
+    if launched is not None:
+        typer.echo(f"{launched:.1f} launches on the GPU per token, with graphs counted as one")
+    result = document(model, phases, launched)
     _write(settings, f"{model.name.rstrip('/').rsplit('/', 1)[-1]}-{result['dtype']}", result)
     if as_json:
         typer.echo(json.dumps(result, allow_nan=False))
