@@ -24,7 +24,7 @@ from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
 from kerv_cli.methods.early.drafter import EarlyDrafter
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.methods.unverified import ParallelPass
-from kerv_cli.targets.attention import SIZES, CapturedCache, attention_mask
+from kerv_cli.targets.attention import SIZES, CapturedCache
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.features import WordTokenizer, places_of, privileged_features, scene_features, scene_width
 from kerv_cli.targets.compact.program import compile_parts
@@ -157,12 +157,11 @@ def test_a_padded_bucket_computes_its_tokens(tokens):
     trunk = Trunk(32, 2, 2, 48).eval()
     x, positions = torch.randn(1, 20 + tokens, 32), torch.arange(20 + tokens)
     with torch.inference_mode():
-        uncached = trunk.run_layers(x, positions, None, None, None)[:, 20:]
+        uncached = trunk.forwarded(x, positions, None, None, None)[:, 20:]
         cache = trunk.new_cache(1, 150, fixed=True)
         assert isinstance(cache, CapturedCache)
         for first, last in ((0, 20), (20, 20 + tokens)):
-            mask = attention_mask(None, last - first, cache, x)
-            in_buckets = cache.run(trunk.run_layers, x[:, first:last], positions[first:last], mask)
+            in_buckets = cache.run(trunk.forwarded, x[:, first:last], positions[first:last], None)
             cache.length = last
     assert cache.steps.keys() == set(SIZES)
     assert torch.allclose(in_buckets, uncached, atol=1e-5)

@@ -194,7 +194,7 @@ def test_a_filled_step_drops_nothing(wrong, use_target_token):
     assert chunk.tokens == [*known, *rest][:N]
     step = first // D
     last = SPACE.values_of(np.array(chunk.tokens[step * D - D : step * D])) if step else PAST.history()[-1]
-    executed = SPACE.normalise(chunk.actions()).flatten()
+    executed = SPACE.normalise(chunk.actions(chunk.values(chunk.steps))).flatten()
     assert executed[list(filled)] == pytest.approx([last[index % D] for index in filled], abs=1e-6)
     assert decoder.parts.rectifier.resting == (5 if filled else 0)  # type: ignore[union-attr]
 
@@ -214,7 +214,7 @@ def test_one_forward_whatever_is_rejected(wrong, use_target_token):
     # where the target's own token was the last one nothing is missing, and nothing was predicted
     assert (chunk.closed is None) == (known == N)
     steps = max(1, -(-known // D))
-    actions = chunk.actions()
+    actions = chunk.actions(chunk.values(chunk.steps))
     assert actions.shape == (steps, D)
     assert chunk.compensated == steps * D - known
     assert actions.reshape(-1)[:known] == pytest.approx(SPACE.values_of(np.array(TRUTH[:known], dtype=int)), abs=1e-6)

@@ -178,12 +178,17 @@ class ActionSpace:
 
     def normalise(self, actions: np.ndarray) -> np.ndarray:
         """Map actions (..., D) from environment units to [-1, 1]. Values outside are clipped."""
-        low, high = np.asarray(self.low), np.asarray(self.high)
-        return np.clip(2.0 * (actions - low) / (high - low) - 1.0, -1.0, 1.0)
+        low, span = self._low_and_span
+        return np.clip(2.0 * (actions - low) / span - 1.0, -1.0, 1.0)
 
     def unnormalise(self, values: np.ndarray) -> np.ndarray:
-        low, high = np.asarray(self.low), np.asarray(self.high)
-        return (values + 1.0) / 2.0 * (high - low) + low
+        low, span = self._low_and_span
+        return (values + 1.0) / 2.0 * span + low
+
+    @cached_property
+    def _low_and_span(self) -> tuple[np.ndarray, np.ndarray]:
+        low = np.asarray(self.low)
+        return low, np.asarray(self.high) - low
 
     def bins_of(self, values: np.ndarray) -> np.ndarray:
         """Return the int64 tokens of normalised values. Values outside [-1, 1] get the first or last token."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -229,7 +229,7 @@ class Chunk:
         if proposer == PARALLEL:
             self.commit(Round(PARALLEL, target_tokens=tuple(tokens), committed=self.size), tokens)
             return
-        check_tokens(np.asarray(tokens), self.space.tokens, proposer)
+        check_tokens(tokens, self.space.tokens, proposer)
         self.tokens = self.until_end(tokens[: self.size])
         drafted = tuple(self.tokens)
         size = len(drafted)
@@ -246,7 +246,7 @@ class Chunk:
         """
         if not with_target_token:
             del self.tokens[-1]
-            self.rounds[-1] = replace(self.rounds[-1], committed=self.rounds[-1].accepted)
+            self.rounds[-1] = self.rounds[-1]._replace(committed=self.rounds[-1].accepted)
         values, start = found.values, len(self.tokens)
         if found.ends:
             del self.tokens[values.size :]
@@ -261,16 +261,17 @@ class Chunk:
         decided = self.space.values_of(np.array(self.tokens[: whole * self.dofs], dtype=np.int64))
         return self.episode.history(decided.reshape(whole, self.dofs))
 
-    def actions(self) -> np.ndarray:
-        """Return the chunk's actions (S, D), float32, environment units. S < `steps` if a rectifier ended the chunk."""
-        return self.space.unnormalise(self.values(self.steps)).astype(np.float32)
+    def actions(self, values: np.ndarray) -> np.ndarray:
+        """Return the actions (S, D) of `values`, float32, environment units; S ≤ `steps`."""
+        return self.space.unnormalise(values[: self.steps]).astype(np.float32)
 
     def values(self, steps: int) -> np.ndarray:
         """Return the normalised actions (S, D). S is `steps` for FAST tokens, else the number of decoded steps."""
         if self.closed is not None:
             return self.closed
         values = self.space.chunk_values(self.tokens, steps)
-        values.flat[list(self.filled)] = list(self.filled.values())
+        if self.filled:
+            values.flat[list(self.filled)] = list(self.filled.values())
         return values
 
     def record(self, actions: np.ndarray, seconds: float, phases: dict[str, float]) -> DecodeRecord:
@@ -293,7 +294,7 @@ class Chunk:
         )
 
 
-def check_tokens(tokens: np.ndarray, vocabulary: int, proposer: str) -> None:
-    if tokens.size and not (tokens.min() >= 0 and tokens.max() < vocabulary):
-        wrong = next(token for token in tokens.tolist() if not 0 <= token < vocabulary)
+def check_tokens(tokens: Sequence[int], vocabulary: int, proposer: str) -> None:
+    if tokens and not (min(tokens) >= 0 and max(tokens) < vocabulary):
+        wrong = next(token for token in tokens if not 0 <= token < vocabulary)
         raise KervError(f"the proposer '{proposer}' drafted token {wrong}: tokens are 0 to {vocabulary - 1}")

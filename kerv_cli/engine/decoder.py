@@ -105,6 +105,7 @@ class Decoder(Follower):
         super().__init__(target.actions, target.cameras)
         self.target, self.device, self.parts = target, target.device, parts or Parts()
         self.predicts = target if isinstance(target, PredictsTokens) else None
+        self.continues = target if isinstance(target, ContinuesGreedily) else None
         self.steps = chunk_steps(chunk, target.chunk)
         self.acceptance: DistanceRule = self.parts.acceptance or StrictRule(target.actions)
         self.threshold: Threshold = self.parts.threshold or Fixed(0)
@@ -148,9 +149,10 @@ class Decoder(Follower):
             return prompt
 
         chunk = self.decode_prompt(encode, stopwatch)
-        actions = chunk.actions()
+        values = chunk.values(self.target.chunk)
+        actions = chunk.actions(values)
         self.decoded.append(chunk.tokens)
-        self.planned = [*chunk.values(self.target.chunk)]
+        self.planned = [*values]
         measure = self.threshold.measure
         self.threshold.update(chunk.variability if measure == MEAN else variability(chunk.rounds, self.space, measure))
         if self.parts.rectifier is not None:
@@ -221,8 +223,8 @@ class Decoder(Follower):
     def decode_plainly(self, chunk: Chunk, stopwatch: Stopwatch) -> None:
         """Decode the remaining tokens without drafts: in one call if the target is a `ContinuesGreedily`."""
         tokens = None
-        if isinstance(self.target, ContinuesGreedily):
-            tokens = self.target.continue_greedily(
+        if self.continues is not None:
+            tokens = self.continues.continue_greedily(
                 chunk.tokens[-1], chunk.remaining, chunk.target.cache, self.space.end
             )
         tokens = self.forward_singly(chunk, stopwatch) if tokens is None else tokens
@@ -274,7 +276,7 @@ class Decoder(Follower):
         # nowhere else in a round does the CPU wait for the GPU
         targets, *remote = read(predicted, *draft.remote)
         tree = draft.judged(remote)
-        return Verified(hidden, tree, targets.astype(np.int64).tolist(), draft.levels or tree.levels)
+        return Verified(hidden, tree, targets.astype(np.int64, copy=False).tolist(), draft.levels or tree.levels)
 
     def accept(self, chunk: Chunk, verified: Verified, proposer: Proposer | None) -> Accepted:
         if proposer is None:
@@ -322,9 +324,8 @@ class Decoder(Follower):
         if rows == list(range(len(rows))):  # the first nodes of a chain are already in their slots
             cache.length = end + len(rows)
             return hidden[:, : before + len(rows)]
-        kept = upload(rows, hidden.device)
-        cache.compact(end, end + kept)
-        return torch.cat([hidden[:, :before], hidden[:, before + kept]], 1)
+        cache.compact(end, upload([end + row for row in rows], hidden.device))
+        return hidden.index_select(1, upload([*range(before), *(before + row for row in rows)], hidden.device))
 
     def rectify(self, chunk: Chunk, hidden: Tensor, stopwatch: Stopwatch) -> Tensor:
         """After a rejection, let the rectifier predict the missing values of the rejected token's control step.

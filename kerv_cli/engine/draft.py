@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -47,18 +47,19 @@ class Draft:
 
     def check(self, vocabulary: int, proposer: str, depth: int) -> None:
         device, reached = self.tokens.device, len(self)
+        if self.parents is not None and self.parents.device != device:
+            raise KervError(
+                f"the proposer '{proposer}' drafted tokens on {device} and parents on {self.parents.device}: put "
+                "both on one device"
+            )
         if device == HOST:
-            check_tokens(self.tokens.numpy(), vocabulary, proposer)
-        if self.parents is not None:
-            if self.parents.device != device:
-                raise KervError(
-                    f"the proposer '{proposer}' drafted tokens on {device} and parents on {self.parents.device}: put "
-                    "both on one device"
-                )
             try:
-                reached = max(self.tree.depths, default=-1) + 1 if device == HOST else self.levels
+                reached = max(self.tree.depths, default=-1) + 1
             except ValueError as error:
                 raise KervError(f"the proposer '{proposer}' drafted an invalid tree: {error}") from error
+            check_tokens(self.tree.tokens, vocabulary, proposer)
+        elif self.parents is not None:
+            reached = self.levels
             if len(self) and not reached:
                 raise KervError(f"the proposer '{proposer}' drafted a tree on {device} without Draft.levels")
         if reached > depth:
@@ -80,7 +81,7 @@ class Draft:
     def tokens_after(self, committed: list[int], device: torch.device) -> Tensor:
         """Return the k tokens in `committed`, followed by the draft's n tokens: (k + n,) int64 on `device`."""
         if self.tokens.device == HOST:
-            return upload(np.concatenate([np.array(committed, dtype=np.int64), self.tokens.numpy()]), device)
+            return upload([*committed, *self.tree.tokens], device)
         return torch.cat([upload(committed, device), self.tokens]) if committed else self.tokens
 
     @cached_property
@@ -95,18 +96,17 @@ class Draft:
             return ancestors_on_device(self.parents, self.levels)
         if self.paths is not None:
             return self.paths
-        parents = self.parents.tolist()
-        return None if parents == list(range(ROOT, len(self) - 1)) else ancestors_of(parents)
+        parents = self.tree.parents
+        return None if parents == tuple(range(ROOT, len(self) - 1)) else ancestors_of(parents)
 
     def positions(self, start: int, before: int, device: torch.device) -> Tensor:
         """Return the positions (before + n,) of `before` tokens, the first at `start`, and of the draft after them."""
         stop, seen = start + before, self.ancestors
         if seen is None:
-            return torch.arange(start, stop + len(self), device=device)
-        depths = seen.sum(-1) - 1
-        if isinstance(depths, np.ndarray):
-            return upload(np.concatenate([np.arange(start, stop), stop + depths]), device)
-        return torch.cat([torch.arange(start, stop, device=device), stop + depths])
+            return consecutive(start, stop + len(self), device)
+        if isinstance(seen, np.ndarray):
+            return upload([*range(start, stop), *(stop + depth for depth in self.tree.depths)], device)
+        return torch.cat([torch.arange(start, stop, device=device), stop - 1 + seen.sum(-1)])
 
     def visible(self, before: int) -> np.ndarray | Tensor | None:
         """Return the attention mask of `before` tokens and the draft after them, (before + n, before + n) bool.
@@ -116,9 +116,11 @@ class Draft:
         seen, size = self.ancestors, before + len(self)
         if seen is None:
             return None
-        mask: Any = np.tri(size, dtype=bool)
+        mask: Any
         if isinstance(seen, Tensor):
             mask = torch.ones(size, size, dtype=torch.bool, device=seen.device).tril_()
+        else:
+            mask = lower_triangle(size).copy()
         mask[before:, before:] = seen
         return mask
 
@@ -128,6 +130,11 @@ def _vector(numbers: Sequence[int]) -> Tensor:
 
 
 EMPTY = Draft.of(())
+
+
+@lru_cache(maxsize=256)
+def lower_triangle(size: int) -> np.ndarray:
+    return np.tri(size, dtype=bool)
 
 
 # both return `Draft.ancestors`, (n, n) bool
@@ -148,6 +155,11 @@ def ancestors_on_device(parents: Tensor, levels: int) -> Tensor:
     return reached > 0
 
 
+def consecutive(start: int, stop: int, device: torch.device) -> Tensor:
+    # numpy is several times as fast as torch for so few numbers
+    return torch.from_numpy(np.arange(start, stop)) if device == HOST else torch.arange(start, stop, device=device)
+
+
 def upload(numbers: ArrayLike, device: torch.device) -> Tensor:
     """Return integers as a tensor on the device, without waiting for the copy."""
     host = torch.from_numpy(np.asarray(numbers))  # five times as fast as torch.as_tensor for a list
@@ -160,8 +172,8 @@ def upload(numbers: ArrayLike, device: torch.device) -> Tensor:
 
 def read(*parts: Tensor) -> list[np.ndarray]:
     """Copy several vectors from one device to the CPU in a single transfer, and wait for it."""
-    sizes, together = list(map(len, parts)), parts[0]
-    if len(parts) > 1:
-        mixed = len({part.dtype for part in parts}) > 1
-        together = torch.cat([*map(Tensor.double, parts)] if mixed else parts)
-    return [vector.numpy() for vector in together.cpu().split(sizes)]
+    if len(parts) == 1:
+        return [parts[0].cpu().numpy()]
+    mixed = len({part.dtype for part in parts}) > 1
+    together = torch.cat([*map(Tensor.double, parts)] if mixed else parts)
+    return [vector.numpy() for vector in together.cpu().split(list(map(len, parts)))]

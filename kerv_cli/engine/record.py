@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,8 +20,7 @@ PARALLEL = "parallel"  # mode of a round, and of its decode, in which a parallel
 PHASES = ("vision", "prefill", "propose", "verify", "accept", "rectify", "other")
 
 
-@dataclass(frozen=True)
-class Round:
+class Round(NamedTuple):
     """One round of a decode: a draft, and the target tokens that it was compared with.
 
     Attributes:
@@ -161,20 +161,18 @@ def variability(rounds: Sequence[Round], space: ActionSpace, measure: str = MEAN
     """
     if space.code is not None:
         return None
-    drafted, targets, places = list[int](), list[int](), list[int]()
+    differences, centres, strict = list[float](), space.centres, space.is_strict.tolist()
     for one in rounds:
         if one.drafted and one.mode != "skip":
             count = one.accepted if measure.endswith("accepted") else len(one.drafted)
-            drafted += one.drafted[:count]
-            targets += one.target_tokens[:count]
-            places += range(one.start, one.start + count)
-    if not places:
+            pairs = zip(one.drafted[:count], one.target_tokens, strict=False)
+            for place, (draft, target) in enumerate(pairs, one.start):
+                if not strict[place % space.dofs]:
+                    differences.append(abs(centres[draft] - centres[target]))
+    if not differences:
         return None
-    first, second = space.centres[[drafted, targets]]
-    differences = np.abs(first - second)[~space.is_strict[np.array(places) % space.dofs]]
-    if not len(differences):
-        return None
-    return float(differences.sum() if measure.startswith("sum") else differences.mean())
+    found = np.array(differences)
+    return float(found.sum() if measure.startswith("sum") else found.mean())
 
 
 def path_length(points: np.ndarray) -> float:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import fields
 from operator import attrgetter, itemgetter
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import pyarrow as pa
@@ -112,8 +111,8 @@ def _row(columns: Fields, record: object) -> dict[str, Any]:
 EPISODE_SCHEMA = _schema(_EPISODE)
 
 _TOKENS = pa.list_(pa.int32())
-_OF_ROUND = {"str": TEXT, "int": pa.int32(), "tuple[int, ...]": _TOKENS}
-_ROUND = pa.struct([(field.name, _OF_ROUND[str(field.type)]) for field in fields(Round)])
+_OF_ROUND = {str: TEXT, int: pa.int32(), tuple[int, ...]: _TOKENS}
+_ROUND = pa.struct([(name, _OF_ROUND[kind]) for name, kind in get_type_hints(Round).items()])
 _DECODE: Fields = {
     **_columns("mode", kind=TEXT),
     **_columns("forwards"),
@@ -121,7 +120,7 @@ _DECODE: Fields = {
     **_columns(*PHASES, kind=FLOAT, read=_phase, as_="seconds.{}"),
     "tokens": (_TOKENS, lambda decode: list(decode.tokens)),
     "actions": (pa.list_(pa.list_(pa.float32())), lambda decode: np.asarray(decode.actions, np.float32).tolist()),
-    "rounds": (pa.list_(_ROUND), lambda decode: list(map(vars, decode.rounds))),
+    "rounds": (pa.list_(_ROUND), lambda decode: [one._asdict() for one in decode.rounds]),
     **_columns("compensated"),
     **_columns("skipped", kind=FLAG),
     **_columns("variability", "similarity", "metric", "deviation", kind=FLOAT),

@@ -9,6 +9,7 @@ heads of keys and values.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -45,18 +46,19 @@ class Cache:
         self.layers = list(self.buffer)  # (2, B, A, slots, C): keys, values
         self.capacity = capacity
         self.length = self.copied = 0
-        self._copies: tuple[np.ndarray, np.ndarray] | None = None
+        self._copies: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
-    def copies(self, width: int) -> tuple[np.ndarray, np.ndarray, int]:
+    def copies(self, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
         """Return the memory in which compiled programs keep copies of keys and values, in panels of `width` numbers.
 
         Returns:
-            The keys (layers, B · A, panels, C, width), the values (layers, B · A, panels, slots, width), and how many
-                leading slots are filled.
+            The buffer, the keys (layers, B · A, panels, C, width), the values (layers, B · A, panels, slots, width),
+                and how many leading slots are filled.
         """
         if self._copies is None:
             layers, _, batch, heads, slots, channels = self.buffer.shape
             self._copies = (
+                self.buffer.numpy(),
                 np.empty((layers, batch * heads, -(-slots // width), channels, width), np.float32),
                 np.empty((layers, batch * heads, -(-channels // width), slots, width), np.float32),
             )
@@ -69,7 +71,11 @@ class Cache:
             slots: (n,) slots of the kept tokens in increasing order, none before `start`.
         """
         n = slots.shape[0]
-        self.buffer[..., start : start + n, :] = self.buffer.index_select(-2, slots)
+        if self._copies is not None:
+            buffer = self._copies[0]  # numpy is faster for so few numbers
+            buffer[..., start : start + n, :] = buffer.take(slots.numpy(), -2)
+        else:
+            self.buffer[..., start : start + n, :] = self.buffer.index_select(-2, slots)
         self.length, self.copied = start + n, min(self.copied, start)
 
     def next_slots(self, tokens: int) -> slice:
@@ -146,7 +152,7 @@ def rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
 SIZES = (1, 2, 4, 8, 16, 32, 64, 128)  # numbers of tokens for which graphs are captured, at the first forward of so few
 _WARM_UP = 3  # runs before a capture, in which libraries choose kernels and allocate workspaces
 
-# what a CUDA graph captures: `LayerStack.run_layers`
+# what a CUDA graph captures: `LayerStack.forwarded`
 Compute = Callable[[Tensor, Tensor, Cache, Tensor, Tensor], Tensor]
 
 
@@ -154,46 +160,61 @@ class CapturedCache(Cache):
     """A key/value cache of fixed shapes, with CUDA graphs that run a forward through all layers in one launch.
 
     A graph takes a fixed number of tokens, its size. A forward of T tokens runs in the smallest graph that is large
-    enough. The unused tokens have zeros as input. Their keys and values go to the spare slot, which no other token
-    attends to. A forward of more than 128 tokens, such as a long prompt, runs without a graph, because capturing one
-    would add to the episode's time. The batch size is 1. On a CPU the same computation runs without graphs, for tests.
+    enough. The keys and values of unused tokens go to the spare slot, which no other token attends to. A forward of
+    more than 128 tokens, such as a long prompt, runs without a graph, because capturing one would add to the episode's
+    time. The batch size is 1. On a CPU the same computation runs without graphs, for tests.
 
     Attributes:
+        head: Function that maps hidden states to logits. If set, the graphs also compute `predicted`.
+        predicted: (1, T) the most probable next token after each token of the last forward of at most 128 tokens.
         steps: The graphs, by number of tokens. Empty before the first forward of at most 128 tokens.
     """
 
     fixed = True
+    head: Callable[[Tensor], Tensor] | None = None
+    predicted: Tensor | None = None
 
     def __init__(self, layers: int, heads: int, capacity: int, channels: int, like: Tensor) -> None:
         super().__init__(layers, 1, heads, capacity, channels, like)
         self.steps: dict[int, _Step] = {}
 
-    def run(self, compute: Compute, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
-        """Return the last layer's output (1, T, width), which the next forward in the same graph overwrites.
+    def run(self, compute: Compute, x: Tensor, positions: Tensor, seen: Seen) -> Tensor:
+        """Return the result (1, T, E) of `compute`. The next forward in the same graph overwrites `predicted`.
 
         Args:
             x: (1, T, width) input of the first layer.
             positions: (T,) rotary positions.
-            mask: (T, slots) result of `attention_mask`.
+            seen: (T, M) bool over the last M tokens, as in `attention_mask`. If None, attention is causal.
         """
         tokens = x.shape[1]
         # all at once, at the first forward of any size: later a capture would count in an episode's time
         self.steps = self.steps or {size: _Step(compute, self, size, x.shape[2]) for size in SIZES}
         if tokens > SIZES[-1]:
             slots = torch.arange(self.length, self.length + tokens, device=x.device)
+            mask = attention_mask(seen, tokens, self, x)
+            assert mask is not None
+            self.predicted = None
             return compute(x, positions, self, slots, mask)
-        return self.steps[1 << (tokens - 1).bit_length()].run(x, positions, mask)
+        hidden, self.predicted = self.steps[1 << (tokens - 1).bit_length()].run(x, positions, seen)
+        return hidden
 
 
 class _Step:
-    def __init__(self, compute: Compute, cache: Cache, size: int, width: int) -> None:
+    """One graph. Four small copies fill its inputs. It computes slots and mask itself.
+
+    Attributes:
+        span: The number of cached tokens, of new tokens T, and of columns M of `seen` that are in use.
+    """
+
+    def __init__(self, compute: Compute, cache: CapturedCache, size: int, width: int) -> None:
         self.compute, self.cache = compute, cache
         like, slots = cache.buffer, cache.buffer.shape[-2]
-        self.x = like.new_zeros((1, size, width))
-        self.positions = torch.zeros(size, dtype=torch.long, device=like.device)
-        self.index = torch.full((size,), slots - 1, dtype=torch.long, device=like.device)
-        self.mask = like.new_full((size, slots), -torch.inf)
-        self.mask[:, -1] = 0.0  # a row that attends to nothing would be NaN, which would spread to all others
+        integers: dict[str, Any] = {"dtype": torch.long, "device": like.device}
+        self.x, self.positions = like.new_zeros((1, size, width)), torch.zeros(size, **integers)
+        self.seen = torch.zeros((size, slots), dtype=torch.bool, device=like.device)
+        self.causal = torch.ones((size, size), dtype=torch.bool, device=like.device).tril_()
+        self.span = torch.zeros(3, **integers)
+        self.row, self.slot = torch.arange(size, **integers), torch.arange(slots, **integers)
         self.graph: torch.cuda.CUDAGraph | None = None
         if not like.is_cuda:
             return
@@ -207,19 +228,28 @@ class _Step:
         with torch.cuda.graph(self.graph):
             self.out = self._compute()
 
-    def _compute(self) -> Tensor:
-        return self.compute(self.x, self.positions, self.cache, self.index, self.mask)
+    def _compute(self) -> tuple[Tensor, Tensor | None]:
+        start, tokens, last = self.span.unbind()
+        spare, stop, used = self.slot.shape[0] - 1, start + tokens, self.row < tokens
+        column = self.slot - (stop - last)  # of `seen`; tokens before these are visible
+        visible = self.seen[:, column.clamp(0, spare)] | (column < 0)
+        # an unused row sees the spare slot only; if it saw nothing it would be NaN, which would spread to all others
+        visible = torch.where(used[:, None], visible & (self.slot < stop), self.slot == spare)
+        mask = torch.zeros_like(visible, dtype=self.x.dtype).masked_fill_(~visible, -torch.inf)
+        slots = torch.where(used, start + self.row, spare)
+        hidden, head = self.compute(self.x, self.positions, self.cache, slots, mask), self.cache.head
+        return hidden, head(hidden).argmax(-1) if head is not None else None
 
-    def run(self, x: Tensor, positions: Tensor, mask: Tensor) -> Tensor:
-        tokens, start = x.shape[1], self.cache.length
-        self.x.zero_()[:, :tokens].copy_(x)
+    def run(self, x: Tensor, positions: Tensor, seen: Seen) -> tuple[Tensor, Tensor | None]:
+        tokens = x.shape[1]
+        if not isinstance(seen, Tensor):
+            seen = self.causal[:tokens, :tokens] if seen is None else upload(seen, x.device)
+        self.x[:, :tokens].copy_(x)
         self.positions[:tokens].copy_(positions)
-        self.index.fill_(self.mask.shape[1] - 1)
-        torch.arange(start, start + tokens, out=self.index[:tokens])
-        self.mask[:, :-1] = -torch.inf
-        self.mask[:tokens].copy_(mask)
-        self.mask[tokens:, -1] = 0.0
-        if self.graph is None:
-            return self._compute()[:, :tokens]
-        self.graph.replay()
-        return self.out[:, :tokens]
+        self.seen[:tokens, : seen.shape[1]].copy_(seen)
+        self.span.copy_(upload([self.cache.length, tokens, seen.shape[1]], x.device))
+        if self.graph is not None:
+            self.graph.replay()
+        hidden, predicted = self.out if self.graph is not None else self._compute()
+        # a copy: callers keep it, and the next forward in this graph overwrites the original
+        return hidden[:, :tokens].clone(), predicted[:, :tokens] if predicted is not None else None

@@ -25,7 +25,7 @@ from kerv_cli.base.spaces import ObservationSpace
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decisions import ROOT
 from kerv_cli.engine.decoder import Decoder, Parts, greedy
-from kerv_cli.engine.draft import HOST, Draft, upload
+from kerv_cli.engine.draft import HOST, Draft, consecutive, upload
 from kerv_cli.engine.parts import Fixed
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.engine.protocol import JoinsDrafters, ReadableTarget, Seen, Target
@@ -116,7 +116,7 @@ class DrafterProposer(Proposer):
 
     def observe(self, following: Tensor, hidden: Tensor, first: int) -> None:
         self.cache.length = first
-        positions = torch.arange(first, first + hidden.shape[1], device=hidden.device)
+        positions = consecutive(first, first + hidden.shape[1], hidden.device)
         self.hidden = self.drafter(following, hidden, positions, self.cache)[0, -1]
 
     def chain(self, depth: int) -> Tensor:

@@ -18,7 +18,7 @@ from kerv_cli.base.registry import NoSettings
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
 from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.decoder import greedy
-from kerv_cli.engine.draft import read
+from kerv_cli.engine.draft import HOST, read, upload
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.engine.protocol import JoinsDrafters, ReadableTarget
 from kerv_cli.methods.context import Context
@@ -161,7 +161,7 @@ class EarlyProposer(ChainProposer):
     def row(self, chunk: Chunk, radius: int) -> Tensor:
         """Draft a chunk for an acceptance radius in bins: (N + 1,), the result of `EarlyNetwork.draft`."""
         if self.compiled is not None:
-            return self.compiled(torch.tensor([[radius]]), chunk.target.prompt)[0][0]
+            return self.compiled(upload([[radius]], HOST), chunk.target.prompt)[0][0]
         return self.early.draft(self.target.pooled(chunk.target.prompt), radius)[0]
 
     def chains(self, chunk: Chunk, depth: int) -> list[list[int]]:

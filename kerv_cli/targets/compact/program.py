@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from torch.utils.weak import WeakIdKeyDictionary
 
 from kerv_cli.base.files import own_folder
+from kerv_cli.engine.protocol import Seen
 from kerv_cli.targets.attention import Cache
 from kerv_cli.targets.checkpoint import load_state
 from kerv_cli.targets.compact.recording import ARGMAX, BFLOAT, BLOCKED, BRANCH, COLUMNS, FLOAT, HALF, INT8, PANEL, Tape
@@ -140,6 +141,8 @@ def stored_bytes(tensors: Iterable[Tensor]) -> float:
 
 _WITHOUT_ATTENTION = Cache(1, 1, 1, 1, 1, torch.empty(0))
 NOTHING = -1  # no result, or no token that ends a repetition
+_CAUSAL = np.zeros((0, 1), np.float32)  # the mask of causal attention
+_FIRST = np.zeros(1, np.int64)  # positions of a program without attention
 
 
 class Program:
@@ -185,7 +188,7 @@ class Program:
         self.run = kernels().run
 
     def __call__(
-        self, *inputs: Tensor, positions: Tensor | None = None, cache: Cache | None = None, mask: Tensor | None = None
+        self, *inputs: Tensor, positions: Tensor | None = None, cache: Cache | None = None, seen: Seen = None
     ) -> list[Tensor]:
         """Compute the outputs, (rows, …) each.
 
@@ -194,12 +197,20 @@ class Program:
             positions: (T,) rotary positions. None if the program has no attention.
             cache: The keys and values of the new tokens are written after the cached ones, but `cache.length` stays as
                 it is.
-            mask: Result of `attention_mask`. If None, attention is causal.
+            seen: Attention mask (T, M) bool over the last M tokens, as in `attention_mask`. None: causal attention.
         """
-        frames = self._execute(inputs, positions, cache, mask)
+        hidden = _CAUSAL
+        if seen is not None:
+            tokens, last = seen.shape
+            hidden = np.zeros((tokens, (cache.length if cache is not None else 0) + tokens), np.float32)
+            np.logical_not(np.asarray(seen), out=hidden[:, hidden.shape[1] - last :])
+        frames = self._execute(inputs, _FIRST if positions is None else positions.numpy(), cache, hidden)
         found = []
         for first, rows, stride, shape in self.results:
-            block = frames[:, first : first + rows * stride].reshape(len(frames), rows, stride)[:, :, : shape[-1]]
+            if rows == 1:
+                block = frames[:, first : first + shape[-1]]
+            else:
+                block = frames[:, first : first + rows * stride].reshape(len(frames), rows, stride)[:, :, : shape[-1]]
             found.append(torch.from_numpy(np.ascontiguousarray(block)).view(-1, *shape))
         return found
 
@@ -215,8 +226,8 @@ class Program:
             (executions, B) float32, the result of the ARGMAX operation in each execution.
         """
         results = np.full((times, 1, inputs[0].numel() // self.places[0][1]), NOTHING, np.float32)
-        self._execute(inputs, torch.tensor([cache.length]), cache, None, results, end)
-        return results[: _executed(results), 0]
+        self._execute(inputs, np.array([cache.length]), cache, _CAUSAL, results, end)
+        return results[: cache.copied - cache.length, 0]
 
     def grow(
         self, levels: int, top_k: int, nodes: int, *inputs: Tensor, position: int, cache: Cache
@@ -239,60 +250,60 @@ class Program:
                 is node i or one of its ancestors.
         """
         results = np.empty((levels, 4, top_k * top_k), np.float32)
-        mask = torch.ones(top_k, cache.length + levels * top_k)
-        mask[:, : cache.length] = 0.0
+        hidden = np.ones((top_k, cache.length + levels * top_k), np.float32)
+        hidden[:, : cache.length] = 0.0
         rows = [x.expand(top_k, *x.shape[1:]) for x in inputs]
-        self._execute(rows, torch.full((top_k,), position), cache, mask, results)
+        self._execute(rows, np.full(top_k, position), cache, hidden, results)
         return kernels().best(results, top_k, nodes)
 
     def _execute(
         self,
         inputs: Sequence[Tensor],
-        positions: Tensor | None,
+        positions: np.ndarray,
         cache: Cache | None,
-        mask: Tensor | None,
+        hidden: np.ndarray,
         results: np.ndarray | None = None,
         end: int | None = None,
     ) -> np.ndarray:
         """Execute the program len(results) times, or once without `results`. Return the frames (rows, size).
 
         Args:
+            hidden: (T, slots) float32, 0 for slots that a token sees. `_CAUSAL` if attention is causal.
             results: (times, 1, B) float32, or (levels, 4, top_k²) for `grow`. It is filled with the results of each
                 execution.
         """
-        where = np.zeros(1, np.int64) if positions is None else positions.numpy()
-        rows, tokens = inputs[0].numel() // self.places[0][1], len(where)
+        rows, tokens = inputs[0].numel() // self.places[0][1], len(positions)
         results = np.empty((1, 1, rows), np.float32) if results is None else results
         times = len(results)
         frames = np.empty((rows, self.size), np.float32)
         for (first, size), value in zip(self.places, inputs, strict=True):
-            frames[:, first : first + size] = value.float().numpy().reshape(rows, size)
+            plain = value.float() if value.dtype == torch.bfloat16 else value
+            frames[:, first : first + size] = plain.numpy().reshape(rows, size)
         if cache is None:
             layers, heads, channels = self.cache
             like = torch.empty(0)
             cache = Cache(layers, rows // tokens, heads, tokens, channels, like) if layers else _WITHOUT_ATTENTION
-        start, buffer, stop = cache.length, cache.buffer.numpy(), cache.length + tokens * times
+        start, (buffer, keys, values, filled) = cache.length, cache.copies(PANEL)
+        stop = start + tokens * times
         if stop > buffer.shape[4]:
             raise IndexError(f"{tokens * times} tokens after {start} in a cache of {buffer.shape[4]}")
-        keys, values, filled = cache.copies(PANEL)
-        seen = np.zeros((0, 1), np.float32) if mask is None else mask.float().numpy()
-        rest = frames, where, start, buffer, keys, values, filled, seen, results
+        rest = frames, positions, start, buffer, keys, values, filled, hidden, results
         stop_at = NOTHING if end is None else end
         if self.blocked:
             self._alternate(times, stop_at, *rest)
         else:
             self.run(self.ops, 0, times, self.last, self.indices, self.numbers, *rest, stop_at)
-        cache.copied = stop if end is None else start + tokens * _executed(results)
+        cache.copied = stop if end is None else start + tokens * int((results[:, 0, 0] != NOTHING).sum())
         return frames
 
     def _alternate(self, times: int, end: int, frames: np.ndarray, *rest: Any) -> None:
         # one compiled call executes all operations between two multiplications by oneDNN
         memory, run = torch.from_numpy(frames), self.run
-        where, start, buffer, keys, values, filled, seen, results = rest
+        positions, start, buffer, keys, values, filled, hidden, results = rest
         for time in range(times):
             begin, stop = 0, self.last if time == times - 1 else len(self.ops)
-            held = start + time * len(where) if time else filled
-            rest = frames, where, start, buffer, keys, values, held, seen, results
+            held = start + time * len(positions) if time else filled
+            rest = frames, positions, start, buffer, keys, values, held, hidden, results
             for i, matrix, rows in self.blocked:
                 if i < stop:
                     run(self.ops[begin:i], time, time + 1, i - begin, self.indices, self.numbers, *rest, NOTHING)
@@ -302,10 +313,6 @@ class Program:
             run(self.ops[begin:stop], time, time + 1, stop - begin, self.indices, self.numbers, *rest, NOTHING)
             if end != NOTHING and results[time, 0, 0] == end:
                 return
-
-
-def _executed(results: np.ndarray) -> int:
-    return int((results[:, 0, 0] != NOTHING).sum())
 
 
 def _columns_of(op: dict[str, Any]) -> list[tuple[slice, slice]]:

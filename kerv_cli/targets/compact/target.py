@@ -30,7 +30,7 @@ from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
 from kerv_cli.engine.draft import upload
 from kerv_cli.engine.protocol import Seen
-from kerv_cli.targets.attention import Cache, attention_mask
+from kerv_cli.targets.attention import Cache, CapturedCache
 from kerv_cli.targets.checkpoint import FLOAT32, TargetDescription, save_module, target_fields
 from kerv_cli.targets.compact import features
 from kerv_cli.targets.compact.features import VisionEncoder, WordTokenizer, mlp
@@ -157,8 +157,9 @@ class CompactTarget(Compilable):
         return self.head.weight.dtype
 
     def inputs(self, observation: Observation) -> Inputs:
-        proprioception = upload(np.asarray(observation.proprioception, dtype=np.float32), self.device)[None]
-        state = upload(np.asarray(observation.state, dtype=np.float32), self.device)[None]
+        device = self.device
+        proprioception = upload(np.asarray(observation.proprioception, dtype=np.float32)[None], device)
+        state = upload(np.asarray(observation.state, dtype=np.float32)[None], device)
         given = proprioception.shape[1], state.shape[1]
         # a policy that reads images ignores the state, so that its length does not matter
         sizes = len(self.observation.proprioception), given[1] if self.cameras else self.observation.state
@@ -174,9 +175,9 @@ class CompactTarget(Compilable):
                 raise CheckpointError(
                     f"the image of camera '{camera}' has shape {image.shape}, the target takes {self.frame_shape}"
                 )
-            images = upload(image, self.device).permute(2, 0, 1)[None]
+            images = upload(image.transpose(2, 0, 1)[None], device)
         words = self.words.encode(observation.instruction, self.settings.instruction_tokens)
-        return Inputs(images, proprioception, state, upload([words], self.device))
+        return Inputs(images, proprioception, state, upload([words], device))
 
     def encode(self, observation: Observation) -> Tensor:
         return self.encode_batch(self.inputs(observation))[0]
@@ -191,10 +192,12 @@ class CompactTarget(Compilable):
         given = [inputs.words, inputs.proprioception, inputs.states]
         if self.cameras:
             assert inputs.images is not None
-            images = inputs.images.split(self.settings.image_size, -1)
-            views = (encoder(image) for encoder, image in zip(self.encoders, images, strict=True))
-            tokens, points = zip(*views, strict=True)
-            given[2:] = torch.cat(tokens, 1), torch.cat(points, -1)
+            if not self.further_views:
+                given[2:] = self.vision(inputs.images)
+            else:
+                images = inputs.images.split(self.settings.image_size, -1)
+                views = (encoder(image) for encoder, image in zip(self.encoders, images, strict=True))
+                given[2:] = (torch.cat(parts, 1) for parts in zip(*views, strict=True))  # vision tokens, image points
         if self.compiled is not None and self.runs_compiled(*given):
             prompt, places = self.compiled.prompt(*given)
             return prompt.to(self.dtype), places
@@ -258,10 +261,13 @@ class CompactTarget(Compilable):
             self.enlarges(drafter)
 
     def embed(self, tokens: Tensor) -> Tensor:
-        return self.embedding(tokens)
+        return torch.embedding(self.embedding.weight, tokens)
 
     def new_cache(self, batch: int, capacity: int, fixed: bool | None = None) -> Cache:
-        return self.trunk.new_cache(batch, capacity, fixed)
+        cache = self.trunk.new_cache(batch, capacity, fixed)
+        if isinstance(cache, CapturedCache):
+            cache.head = self.head
+        return cache
 
     def forward(self, x: Tensor, positions: Tensor, cache: Cache | None = None, seen: Seen = None) -> Tensor:
         return self.trunk(x, positions, cache, seen)
@@ -269,18 +275,18 @@ class CompactTarget(Compilable):
     def continue_greedily(self, token: int, count: int, cache: Cache, end: int | None = None) -> list[int] | None:
         if self.compiled is None or cache.fixed:
             return None
-        tokens = self.compiled.step.repeat(count, torch.tensor([[token]]), cache=cache, end=end)
+        tokens = self.compiled.step.repeat(count, upload([[token]], self.device), cache=cache, end=end)
         cache.length += len(tokens)
         return tokens[:, 0].astype(int).tolist()
 
     def predict(self, tokens: Tensor, positions: Tensor, cache: Cache, seen: Seen) -> tuple[Tensor, Tensor]:
         if self.compiled is None or cache.fixed:
             hidden = self(self.embed(tokens[None]), positions, cache, seen)
-            return self.head(hidden[0]).argmax(-1), hidden
-        mask = attention_mask(seen, len(tokens), cache, self.head.weight)
-        found, hidden = self.compiled.step(tokens, positions=positions, cache=cache, mask=mask)
-        cache.length += len(tokens)
-        return found[:, 0].long(), hidden.view(1, len(tokens), -1).to(self.dtype)
+            captured = cache.predicted if isinstance(cache, CapturedCache) else None
+            return captured[0] if captured is not None else self.head(hidden[0]).argmax(-1), hidden
+        found, hidden = self.compiled.step(tokens, positions=positions, cache=cache, seen=seen)
+        cache.length += len(found)
+        return found[:, 0].long(), hidden.view(1, len(found), -1).to(self.dtype)
 
     def parallel_pass(self, prompt: Tensor, cache: Cache | None = None) -> Tensor:
         """Return the outputs of learned queries that take the place of action tokens (docs/methods.md §6).

@@ -146,31 +146,31 @@ class LayerStack(Compilable):
                 seen = seen if isinstance(seen, Tensor) else upload(seen, positions.device)
                 seen = F.pad(F.pad(seen, (0, padding)), (0, 0, 0, padding), value=True)
         x = inputs[0]
-        mask = attention_mask(seen, x.shape[1], cache, x)
         if isinstance(cache, CapturedCache):
-            assert mask is not None
-            hidden = self.finish(cache.run(self.run_layers, self.begin(*inputs), positions, mask))
+            hidden = cache.run(self.forwarded, self.begin(*inputs), positions, seen)
         elif self.runs_compiled(x):
-            hidden = self.compiled(*inputs, positions=positions, cache=cache, mask=mask)[0].view(x.shape).to(x.dtype)
+            hidden = self.compiled(*inputs, positions=positions, cache=cache, seen=seen)[0].view(x.shape).to(x.dtype)
         else:
-            slots = cache.next_slots(x.shape[1]) if cache is not None else None
-            hidden = self.finish(self.run_layers(self.begin(*inputs), positions, cache, slots, mask))
+            mask, slots = attention_mask(seen, x.shape[1], cache, x), None
+            if cache is not None:
+                slots = cache.next_slots(x.shape[1])
+            hidden = self.forwarded(self.begin(*inputs), positions, cache, slots, mask)
         if cache is not None:
             cache.length += tokens  # the next forward overwrites the padding
         return hidden[:, :tokens]
 
     def recorded(self, *inputs: Tensor) -> Tensor:
         """Record the layers' operations on one token, to compile them. Inputs and result are `Recorded` (1, 1, E)."""
-        return self.finish(self.run_layers(self.begin(*inputs), slice(None), None, None, None))
+        return self.forwarded(self.begin(*inputs), slice(None), None, None, None)
 
-    def run_layers(
+    def forwarded(
         self, x: Tensor, positions: Tensor | slice, cache: Cache | None, slots: Slots, mask: Tensor | None
     ) -> Tensor:
-        """Return the output (B, T, width) of the last layer for x (B, T, width), computed by torch."""
+        """Return the hidden states (B, T, E) for x (B, T, width), computed by torch."""
         rotary = self.rotary(positions)
         for i, layer in enumerate(self.layers):
             x = layer(x, rotary, cache.layers[i] if cache is not None else None, slots, mask)
-        return x
+        return self.finish(x)
 
 
 class Trunk(LayerStack):
