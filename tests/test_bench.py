@@ -22,7 +22,7 @@ from kerv_cli.bench.physics import Sizes
 from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.decoder import Decoder, Parts, Stopwatch
 from kerv_cli.episodes.cost import READ_PHASES, Profile, Work, prices, read_profile, work_of, work_of_record
-from kerv_cli.methods.eagle.drafter import DrafterProposer
+from kerv_cli.methods.eagle.network import DrafterProposer
 from kerv_cli.targets.openvla.config import Language
 
 pytestmark = pytest.mark.usefixtures("quick_report")

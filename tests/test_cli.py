@@ -50,13 +50,16 @@ for name in Command.every():
     for words in ("--help", "--cfg", "nonsense.key=1"):
         CliRunner().invoke(app, [*name.split(), words])
         loads("torch mujoco pandas sqlalchemy", by=f"kerv {{name}} {{words}}")
+plan = CliRunner().invoke(app, ["sweep", "study=main", "episodes=1", "runtime.device=cpu", "results=" + sys.argv[1], "--plan"])
+assert "140 episodes to run" in plan.output, plan.output
+loads("torch mujoco pandas rerun", by="a plan")
 import kerv_cli.board.app, kerv_cli.report.report
 loads("rerun")
 """
 
 
-def test_nothing_heavy_is_imported_before_it_is_needed():
-    run = process("-c", LOADS, KERV_PLUGINS="")
+def test_nothing_heavy_is_imported_before_it_is_needed(tmp_path):
+    run = process("-c", LOADS, str(tmp_path), KERV_PLUGINS="")
     assert run.returncode == 0, run.stderr
 
 

@@ -20,7 +20,8 @@ from kerv_cli.base.paths import find_target, shipped_dir
 from kerv_cli.base.spaces import Observation, ObservationSpace, Place
 from kerv_cli.engine.decoder import Decoder, Parts
 from kerv_cli.methods.artifacts import Artifacts
-from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
+from kerv_cli.methods.eagle.drafter import EagleDrafter
+from kerv_cli.methods.eagle.network import DrafterProposer
 from kerv_cli.methods.early.drafter import EarlyDrafter
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.methods.unverified import ParallelPass

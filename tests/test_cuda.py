@@ -9,7 +9,7 @@ from kerv_cli.bench.measure import launches_per_token
 from kerv_cli.bench.model import open_model
 from kerv_cli.bench.settings import BenchSettings
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.methods.eagle.drafter import DrafterProposer
+from kerv_cli.methods.eagle.network import DrafterProposer
 from kerv_cli.methods.reuse import JacobiProposer, JacobiProposerSettings
 from kerv_cli.targets.attention import CapturedCache
 from kerv_cli.targets.compact.trunk import Trunk

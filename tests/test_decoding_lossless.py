@@ -27,7 +27,8 @@ from kerv_cli.episodes.settings import RolloutSettings
 from kerv_cli.methods import near
 from kerv_cli.methods.compose import Method
 from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
+from kerv_cli.methods.eagle.drafter import EagleDrafter
+from kerv_cli.methods.eagle.network import DrafterProposer
 from kerv_cli.methods.reuse import JacobiProposer, JacobiProposerSettings, LastActionProposer
 from kerv_cli.targets.compact.features import WordTokenizer
 from kerv_cli.targets.compact.program import compile_parts

@@ -15,15 +15,17 @@ from kerv_cli.base.errors import CheckpointError
 from kerv_cli.engine.decisions import ROOT, TokenTree
 from kerv_cli.methods.artifacts import MadeFor
 from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
+from kerv_cli.methods.eagle.drafter import EagleDrafter
+from kerv_cli.methods.eagle.network import DrafterProposer
 from kerv_cli.methods.early import EarlySettings
-from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyExamples, EarlyNetwork, choose, measure
+from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyExamples, measure
+from kerv_cli.methods.early.network import EarlyNetwork, choose
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.features import WordTokenizer
 from kerv_cli.targets.compact.program import compile_parts
 from kerv_cli.targets.compact.target import CompactTarget
 from kerv_cli.targets.losses import soft_labels, token_loss, within_chunk
-from kerv_cli.targets.observations import split
+from kerv_cli.targets.samples import split
 from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.training.settings import TrainDrafterSettings
 from kerv_cli.training.target import load_samples

@@ -21,8 +21,10 @@ from test_openvla import imported
 from kerv_cli.base import registry
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder, Parts
-from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
-from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
+from kerv_cli.methods.eagle.drafter import EagleDrafter
+from kerv_cli.methods.eagle.network import DrafterProposer
+from kerv_cli.methods.early.drafter import EarlyDrafter
+from kerv_cli.methods.early.network import EarlyProposer
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.openvla.config import Bounds, action_space
 from kerv_cli.worlds import instruction_of, specs

@@ -15,8 +15,9 @@ from kerv_cli.base.spaces import Observation, ObservationSpace, Place
 from kerv_cli.engine.decisions import ROOT, TokenTree
 from kerv_cli.engine.draft import HOST, Draft
 from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
-from kerv_cli.methods.early.drafter import choose
+from kerv_cli.methods.eagle.drafter import EagleDrafter
+from kerv_cli.methods.eagle.network import DrafterProposer
+from kerv_cli.methods.early.network import choose
 from kerv_cli.targets.checkpoint import compact, expanded
 from kerv_cli.targets.compact import program
 from kerv_cli.targets.compact.features import WordTokenizer

@@ -18,8 +18,9 @@ from kerv_cli.engine.draft import Draft
 from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter
-from kerv_cli.methods.early.drafter import EarlyProposer
+from kerv_cli.methods.eagle.drafter import EagleDrafter
+from kerv_cli.methods.eagle.network import DrafterProposer
+from kerv_cli.methods.early.network import EarlyProposer
 from kerv_cli.methods.heisd import (
     Always,
     HybridProposer,

@@ -17,9 +17,11 @@ from kerv_cli.base.registry import NoSettings
 from kerv_cli.engine.decoder import Decoder, Parts, Stopwatch
 from kerv_cli.engine.record import PHASES
 from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.drafter import DrafterProposer, EagleDrafter, EagleNetwork
+from kerv_cli.methods.eagle.drafter import EagleDrafter
+from kerv_cli.methods.eagle.network import DrafterProposer, EagleNetwork
 from kerv_cli.methods.early import EarlySettings
-from kerv_cli.methods.early.drafter import EarlyDrafter, EarlyProposer
+from kerv_cli.methods.early.drafter import EarlyDrafter
+from kerv_cli.methods.early.network import EarlyProposer
 from kerv_cli.methods.heisd import Always, HybridProposer
 from kerv_cli.methods.kerv.prediction import Hold, Kalman, Noise, PredictionProposer
 from kerv_cli.methods.merged import MergedProposer

@@ -33,7 +33,7 @@ from kerv_cli.engine.record import Round
 from kerv_cli.episodes.cost import FORWARDS, Profile
 from kerv_cli.episodes.policy import decoder_for
 from kerv_cli.episodes.settings import RolloutSettings
-from kerv_cli.methods.eagle.drafter import DrafterProposer
+from kerv_cli.methods.eagle.network import DrafterProposer
 from kerv_cli.methods.spec_vla import RelaxedRule
 from kerv_cli.targets.compact.program import Program
 from kerv_cli.targets.provenance import stamp

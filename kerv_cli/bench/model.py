@@ -11,7 +11,7 @@ import torch
 from kerv_cli.base.config import compose, groups
 from kerv_cli.base.errors import UnknownName, UsageError
 from kerv_cli.base.paths import find_target, target_names
-from kerv_cli.base.runtime import DTYPES, set_up
+from kerv_cli.base.runtime import dtype_of, set_up
 from kerv_cli.base.spaces import Observation
 from kerv_cli.bench.physics import Sizes
 from kerv_cli.bench.settings import BenchSettings
@@ -19,7 +19,8 @@ from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.episodes.policy import still_observation
 from kerv_cli.methods.artifacts import Artifacts
 from kerv_cli.methods.eagle import DrafterSettings
-from kerv_cli.methods.eagle.drafter import EagleDrafter, EagleNetwork
+from kerv_cli.methods.eagle.drafter import EagleDrafter
+from kerv_cli.methods.eagle.network import EagleNetwork
 from kerv_cli.methods.settings import PolicySettings
 from kerv_cli.targets.compact.program import compile_parts, stored_bytes
 from kerv_cli.targets.compact.target import CompactTarget
@@ -125,7 +126,7 @@ def _shape(settings: BenchSettings) -> Model:
     shape = replace(shape, chunk=-(-settings.tokens // SPEC.actions.dofs))
     device = torch.device(set_up(settings.runtime)[0])
     on_cpu = device.type == "cpu"
-    dtype = DTYPES[{"auto": "float32" if on_cpu else "bfloat16"}.get(settings.dtype, settings.dtype)]
+    dtype = dtype_of({"auto": "float32" if on_cpu else "bfloat16"}.get(settings.dtype, settings.dtype))
     size = dtype.itemsize + _COMPILED * on_cpu
     layer = 4 * shape.width**2 + 3 * shape.width * shape.feed_forward
     needed, most = _SPARE * size * layer * (shape.layers + 1), memory_of(device)

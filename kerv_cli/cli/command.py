@@ -173,7 +173,7 @@ class CommandWithSettings(FastFlags, TyperCommand):
         if "settings" in self.arguments:
             given["settings"] = _settings(part, overrides, options.pop("cfg"))
         if options.get("plan") and isinstance(given.get("settings"), RunSettings):
-            from kerv_cli.base.runtime import device_of  # imports torch
+            from kerv_cli.base.runtime import device_of
 
             device_of(given["settings"].runtime)
         whole.with_resource(noted([*part.name.split(), *overrides, *names]))

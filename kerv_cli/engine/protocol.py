@@ -6,17 +6,18 @@ Shapes: B sequences in the batch (1 while decoding), P prompt tokens, T new toke
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol, runtime_checkable
-
-import numpy as np
-import torch
-from torch import Tensor, nn
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, runtime_checkable
 
 from kerv_cli.base.spaces import ActionSpace, Observation
 
+if TYPE_CHECKING:
+    import numpy as np
+    import torch
+    from torch import Tensor, nn
+
 # attention mask (T, M) bool, or None if attention is causal; entry [i, j] says whether new token i attends to token j
 # of the last M tokens, which are M − T cached ones and the T new ones; a target on a GPU may get a tensor
-Seen = np.ndarray | Tensor | None
+Seen: TypeAlias = "np.ndarray | Tensor | None"
 
 
 class Cache(Protocol):

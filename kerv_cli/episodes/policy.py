@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
+import time
 from hashlib import sha256
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.files import sha256_of
 from kerv_cli.base.paths import results_dir
 from kerv_cli.base.registry import DRAFTING
-from kerv_cli.base.runtime import set_up
+from kerv_cli.base.runtime import device_of, set_up
 from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.base.wire import packed
 from kerv_cli.engine.chunk import Follower
-from kerv_cli.engine.decoder import Decoder, Stopwatch
-from kerv_cli.engine.record import DecodeRecord
+from kerv_cli.engine.record import PHASES, DecodeRecord
 from kerv_cli.episodes.cost import Profile, prices, read_profile, work_of_record
 from kerv_cli.episodes.episode import Latency, RealClock
 from kerv_cli.episodes.identity import OBSERVATION
@@ -34,6 +33,9 @@ from kerv_cli.worlds import resolve_tasks, spec_of
 from kerv_cli.worlds.spec import EnvironmentSpec
 from kerv_cli.worlds.views import frame_shape
 
+if TYPE_CHECKING:
+    from kerv_cli.engine.decoder import Decoder
+
 PRIVILEGED = "state (privileged)"
 WARM_UP_DECODES = 6
 
@@ -42,6 +44,11 @@ def artifacts_of(settings: Any) -> Artifacts:
     """Return the artifacts of a command's `results` and `policy`, for its `runtime`, which is set up."""
     device, _ = set_up(settings.runtime)
     return Artifacts(settings.results, settings.policy, device, settings.runtime.dtype)
+
+
+def _described(settings: RolloutSettings) -> Artifacts:
+    # to read descriptions alone, which needs no torch
+    return Artifacts(settings.results, settings.policy, device_of(settings.runtime), settings.runtime.dtype)
 
 
 def check(settings: RolloutSettings, is_awaited: bool = False) -> dict[str, str]:
@@ -65,7 +72,7 @@ def check(settings: RolloutSettings, is_awaited: bool = False) -> dict[str, str]
         spec.check_experts(tasks)
         experts = ";".join(f"{task} {expert}" for task, expert in sorted(spec.experts.items()))
         return {"target": "", **({"expert": experts} if experts else {}), OBSERVATION: PRIVILEGED}
-    artifacts = artifacts_of(settings)
+    artifacts = _described(settings)
     target = artifacts.description
     target.check_world(settings.policy.target, spec.name, spec.actions, settings.world.camera.size)
     camera = settings.world.camera.name
@@ -136,7 +143,7 @@ def clock_for(settings: RolloutSettings, spec: EnvironmentSpec) -> RealClock | N
     timing = settings.rollout
     if timing.clock == WAITS:
         return None
-    target = artifacts_of(settings).description if settings.policy.kind == MODEL else None
+    target = _described(settings).description if settings.policy.kind == MODEL else None
     latency: Latency | float = timing.latency_ms / 1000.0
     if timing.latency == MEASURED:
         latency = attrgetter("seconds")
@@ -209,8 +216,8 @@ class ExpertDecoder(Follower):
 
     def decode(self, observation: Observation) -> DecodeRecord:
         """Return a record with the action of one control step, (1, D), environment units."""
-        stopwatch = Stopwatch(torch.device("cpu"))
+        began = time.perf_counter()
         action = self.expert(observation)
-        seconds = stopwatch.stop()
+        seconds = time.perf_counter() - began
         actions = action[None].astype(np.float32)
-        return DecodeRecord((), actions, 0, (), EXPERT, seconds, stopwatch.phases)
+        return DecodeRecord((), actions, 0, (), EXPERT, seconds, {**dict.fromkeys(PHASES, 0.0), "other": seconds})

@@ -16,7 +16,7 @@ import sqlalchemy as sa
 from kerv_cli.base.config import groups
 from kerv_cli.base.errors import UsageError
 from kerv_cli.base.paths import check_writable
-from kerv_cli.base.runtime import set_up
+from kerv_cli.base.runtime import device_of
 from kerv_cli.base.settings import RuntimeSettings
 from kerv_cli.episodes import policy
 from kerv_cli.episodes.identity import Setting
@@ -73,7 +73,7 @@ def check(resolved: ResolvedStudy) -> tuple[Setting, ...]:
                 raise UsageError("runtime.device=auto: workers run elsewhere, name their device: cpu or cuda")
             one.runtime.device = "cpu"
         identity = policy.check(one)
-        one.runtime.device = device if is_elsewhere(resolved.first.runtime) else set_up(one.runtime)[0]
+        one.runtime.device = device if is_elsewhere(resolved.first.runtime) else device_of(one.runtime)
         plain = asdict(one)
         del plain["task"]
         settings.append(Setting(label, point.words, plain, identity, point.varies, point.name))

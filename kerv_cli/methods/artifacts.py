@@ -16,7 +16,7 @@ from kerv_cli.base.files import sha256_of
 from kerv_cli.base.manifests import check_files, read_file
 from kerv_cli.base.paths import artifact_or_path, beside, check_name, check_not_shipped, find_target
 from kerv_cli.base.registry import ArtifactPart
-from kerv_cli.base.runtime import DTYPES
+from kerv_cli.base.runtime import dtype_of
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.protocol import Target
 from kerv_cli.methods.settings import PolicySettings
@@ -229,4 +229,4 @@ def kind_of(name: str) -> Artifact[Any]:
 
 @functools.lru_cache(maxsize=16)
 def _target(folder: Path, sha256: str, device: str, dtype: str) -> Target:
-    return checkpoint.load_target(folder, device, DTYPES[dtype])[0]
+    return checkpoint.load_target(folder, device, dtype_of(dtype))[0]

@@ -6,11 +6,9 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import Tensor, nn
 
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, ObservationSpace
@@ -18,10 +16,12 @@ from kerv_cli.engine.proposer import Proposer
 from kerv_cli.methods.artifacts import Artifact, Artifacts, MadeFor
 from kerv_cli.methods.context import Context
 from kerv_cli.targets import checkpoint
-from kerv_cli.targets.compact.program import load_compiled
-from kerv_cli.targets.observations import Rows, observed_steps, split
+from kerv_cli.targets.samples import Rows, observed_steps, split
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 from kerv_cli.worlds.demos.files import DemoEpisode
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
 
 Metrics = dict[str, float]
 
@@ -88,7 +88,6 @@ class TrainableDrafter(Artifact[DrafterDescription]):
     def network(self, settings: Any, target: Any) -> nn.Module:
         """Return a network with initial weights, for drafting for `target`."""
 
-    @torch.inference_mode()
     def examples(
         self, target: Any, dataset: DemoDataset, settings: Any, held_out: float, progress: OnProgress
     ) -> tuple[Any, Any]:
@@ -106,6 +105,8 @@ class TrainableDrafter(Artifact[DrafterDescription]):
             CheckpointError: There is only one episode, an episode is damaged, or its images have another size than the
                 target takes.
         """
+        import torch
+
         sees, count = bool(target.cameras), len(dataset.episodes)
         stride = int(dataset.manifest.config["frame_stride"]) if sees else 1  # control steps per stored image
         share = min(1.0, settings.samples * stride / sum(episode.steps for episode in dataset.episodes))
@@ -115,7 +116,8 @@ class TrainableDrafter(Artifact[DrafterDescription]):
             steps = evenly(observed_steps(episode, sees), share)
             size = (len(steps),)
             columns = {"episodes": torch.full(size, index), "perturbed": torch.full(size, episode.perturbed)}
-            parts.append(self.decoded(target, episode, steps, dataset.manifest.observation, columns))
+            with torch.inference_mode():
+                parts.append(self.decoded(target, episode, steps, dataset.manifest.observation, columns))
             progress(index + 1, count)
         return split(type(parts[0]).joined(parts), held_out)
 
@@ -159,6 +161,8 @@ class TrainableDrafter(Artifact[DrafterDescription]):
 
     def load(self, path: Path, artifacts: Artifacts) -> Any:
         """Load the network with frozen weights, on the target's device and in the target's number format."""
+        from kerv_cli.targets.compact.program import load_compiled
+
         target, description = artifacts.target, self.checked(path, artifacts.description)
         settings = read(self.settings, description.settings, f"the {self.noun}'s settings", tolerant=True)
         return load_compiled(self.network(settings, target), path, self.kind, target.device, target.dtype)

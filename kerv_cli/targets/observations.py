@@ -7,9 +7,9 @@ of a chunk, D degrees of freedom of an action.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Self, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,35 +20,12 @@ from kerv_cli.base.spaces import Observation, ObservationSpace
 from kerv_cli.engine.protocol import EncodesMany, Target
 from kerv_cli.targets.compact.features import WordTokenizer
 from kerv_cli.targets.compact.target import Inputs
+from kerv_cli.targets.samples import Rows, observed_steps
 from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.worlds import instruction_of
 from kerv_cli.worlds.demos.files import DemoEpisode, EncodedFrames
 
 BATCH = 64  # observations that a target encodes and decodes at once
-
-
-@dataclass(frozen=True)
-class Rows:
-    """Base class of dataclasses of samples. Each field (a tensor, or encoded images) has one row per sample.
-
-    A field for images is None if the samples have no images.
-    """
-
-    def __len__(self) -> int:
-        return next(len(x) for x in vars(self).values() if x is not None)
-
-    def where(self, chosen: Tensor) -> Self:
-        return type(self)(*(None if x is None else x[chosen] for x in vars(self).values()))
-
-    @classmethod
-    def joined(cls, parts: Sequence[Self]) -> Self:
-        joined: list[Any] = []
-        for column in zip(*(vars(part).values() for part in parts), strict=True):
-            if isinstance(column[0], EncodedFrames):
-                joined.append(EncodedFrames.joined(column))
-            else:
-                joined.append(None if column[0] is None else torch.cat(column))
-        return cls(*joined)
 
 
 @dataclass(frozen=True)
@@ -106,10 +83,6 @@ def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarr
     return episode.labels[steps[:, None] + np.arange(chunk)]
 
 
-def observed_steps(episode: DemoEpisode, sees: bool) -> np.ndarray:
-    return episode.frame_steps if sees else np.arange(episode.steps)
-
-
 def observations_of(
     target: Target, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace
 ) -> list[Observation]:
@@ -161,25 +134,3 @@ def check_frames(episode: DemoEpisode, size: int) -> None:
             f"the demonstrations' frames have {height} x {width} pixels, the policy takes {size}: "
             "set target.image_size or record again with world.camera.size"
         )
-
-
-S = TypeVar("S", bound=Rows)
-
-
-def split(samples: S, share: float) -> tuple[S, S]:
-    """Split samples into training and held-out samples. All samples of an episode go to the same part.
-
-    Every k-th episode is held out (k is about 1 / share), so that both parts contain each task, with and without
-    perturbations.
-
-    Args:
-        samples: Samples with a tensor `episodes`, the index of each sample's episode.
-        share: Share of episodes to hold out, above 0 and at most 0.5.
-    """
-    episodes: Tensor = getattr(samples, "episodes")  # noqa: B009
-    count = int(episodes.max()) + 1
-    if count < 2:
-        raise CheckpointError("one demonstration cannot be both trained on and held out: record at least two")
-    every = min(max(2, round(1 / share)), count)
-    held_out = episodes % every == every - 1
-    return samples.where(~held_out), samples.where(held_out)

@@ -36,8 +36,9 @@ from kerv_cli.methods.heisd.curvature import BoundaryRanges
 from kerv_cli.methods.heisd.datastore import Datastore
 from kerv_cli.methods.kerv.prediction import Noise, kalman_weights
 from kerv_cli.targets.checkpoint import TargetDescription
-from kerv_cli.targets.observations import check_tail, observations_of, observed_steps
+from kerv_cli.targets.observations import check_tail, observations_of
 from kerv_cli.targets.provenance import provenance_of
+from kerv_cli.targets.samples import observed_steps
 from kerv_cli.training.demonstrations import check_tasks, demos_for
 from kerv_cli.training.fit import FEW, timed
 from kerv_cli.training.settings import CalibrateSettings, Plan, Stage

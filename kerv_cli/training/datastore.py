@@ -24,8 +24,9 @@ from kerv_cli.base.spaces import ObservationSpace
 from kerv_cli.episodes.policy import artifacts_of
 from kerv_cli.lab.database import Database
 from kerv_cli.methods.heisd import datastore as stored
-from kerv_cli.targets.observations import observations_of, observed_steps, prompts_of, read_chunks
+from kerv_cli.targets.observations import observations_of, prompts_of, read_chunks
 from kerv_cli.targets.provenance import provenance_of
+from kerv_cli.targets.samples import observed_steps
 from kerv_cli.training.demonstrations import demos_for
 from kerv_cli.training.fit import timed
 from kerv_cli.training.settings import BuildDatastoreSettings, Plan, Stage

@@ -33,7 +33,8 @@ from kerv_cli.targets.checkpoint import TargetDescription, load_target, read_tar
 from kerv_cli.targets.compact.features import WordTokenizer, places_of
 from kerv_cli.targets.compact.target import CompactTarget, save_target
 from kerv_cli.targets.losses import labels_of, position_loss, token_loss, within_chunk
-from kerv_cli.targets.observations import Observations, read_chunks, read_observations, split
+from kerv_cli.targets.observations import Observations, read_chunks, read_observations
+from kerv_cli.targets.samples import split
 from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.training import fit
 from kerv_cli.training.demonstrations import check_spaces, check_tasks, name_of, open_demos, seen_by

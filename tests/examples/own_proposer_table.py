@@ -19,7 +19,7 @@ from kerv_cli.engine.chunk import Chunk
 from kerv_cli.engine.proposer import ChainProposer
 from kerv_cli.methods.context import Context
 from kerv_cli.methods.drafters import Metrics, TrainableDrafter
-from kerv_cli.targets.observations import Rows, split
+from kerv_cli.targets.samples import Rows, split
 from kerv_cli.worlds.demos.dataset import DemoDataset, OnProgress
 
 

@@ -20,22 +20,24 @@ from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from itertools import count
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from kerv_cli.base.errors import CheckpointError, UnknownName
 from kerv_cli.base.manifests import content_of
 from kerv_cli.base.spaces import ActionSpace
 from kerv_cli.engine.decisions import ROOT
-from kerv_cli.engine.draft import Draft, read
 from kerv_cli.engine.protocol import ReadableTarget
 from kerv_cli.methods.artifacts import Artifact, Artifacts
 from kerv_cli.methods.heisd import MANIFEST
 from kerv_cli.targets.checkpoint import TargetDescription
 from kerv_cli.worlds import spec_of
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from kerv_cli.engine.draft import Draft
 
 VECTORS, PAYLOAD, PROJECTION = "vectors.npy", "payload.parquet", "projection.npy"
 CROSS = 0.1  # assumed probability that a path of retrieved groups changes to another neighbour after a group
@@ -93,16 +95,18 @@ def prompt_key(prompt: Tensor, target: ReadableTarget, segments: Sequence[str]) 
     Returns:
         (B, S · E) float32 keys for S segments, each with the norm 1.
     """
+    import torch
+
     parts = target.segments
     for name in segments:
         if name not in parts:
             raise UnknownName("part of the prompt", name, parts)
-    pooled = [_unit(prompt[:, parts[name]].float().mean(1)) for name in segments]
-    return _unit(pooled[0] if len(pooled) == 1 else torch.cat(pooled, -1))
 
+    def unit(vectors: Tensor) -> Tensor:
+        return vectors / torch.linalg.vector_norm(vectors, dim=-1, keepdim=True).clamp_min(1e-12)
 
-def _unit(vectors: Tensor) -> Tensor:
-    return vectors / torch.linalg.vector_norm(vectors, dim=-1, keepdim=True).clamp_min(1e-12)
+    pooled = [unit(prompt[:, parts[name]].float().mean(1)) for name in segments]
+    return unit(pooled[0] if len(pooled) == 1 else torch.cat(pooled, -1))
 
 
 def projected(keys: np.ndarray, projection: np.ndarray) -> np.ndarray:
@@ -190,6 +194,8 @@ class Datastore:
 
     def key_of(self, prompt: Tensor, target: ReadableTarget) -> np.ndarray:
         """Return the search key (d,) float32, on the CPU, of an encoded prompt (1, P, E)."""
+        from kerv_cli.engine.draft import read
+
         (pooled,) = read(prompt_key(prompt, target, self.manifest.key)[0])
         key = pooled.astype(np.float32, copy=False)
         return key if self.projection is None else projected(key[None], self.projection)[0]
@@ -270,6 +276,8 @@ def neighbour_tree(
         depth: Maximum number of tokens on a path. If None, paths end with the chunk.
         cross: If 0, paths never change, so only whole chunks are merged.
     """
+    from kerv_cli.engine.draft import Draft
+
     stop = chunks.shape[1] if depth is None else min(chunks.shape[1], start + depth)
     # sets of neighbours are numbers, whose bits stand for neighbours
     everyone = (1 << len(chunks)) - 1
