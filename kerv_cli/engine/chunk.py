@@ -39,16 +39,16 @@ class Follower:
     Attributes:
         cameras: Names of the cameras whose images the decoder reads.
         task: Name of the running episode's task.
-        path: Measured positions of the end effector, (3,) each, metres, oldest first.
+        path: Measured positions of the end effector, (n, 3), metres, oldest first.
         decoded: Tokens of each chunk that was decoded in this episode, oldest first.
         planned: The last chunk's normalised actions (D,) that are not executed yet.
     """
 
     def __init__(self, space: ActionSpace, cameras: tuple[str, ...] = ()) -> None:
         self.space, self.cameras = space, cameras
-        self._start("", [])
+        self._start("", np.zeros((0, 3)))
 
-    def _start(self, task: str, path: list[np.ndarray]) -> None:
+    def _start(self, task: str, path: np.ndarray) -> None:
         self.task, self.path, self.decoded, self.planned = task, path, list[list[int]](), list[np.ndarray]()
         self._executed = np.zeros((0, self.space.dofs))
 
@@ -58,7 +58,7 @@ class Follower:
         Args:
             end_effector: Initial position (3,), metres.
         """
-        self._start(task, [np.asarray(end_effector)])
+        self._start(task, np.array([end_effector]))
 
     def decode(self, observation: Observation) -> DecodeRecord:
         raise NotImplementedError
@@ -66,7 +66,7 @@ class Follower:
     def observe(self, action: np.ndarray, end_effector: np.ndarray) -> None:
         """Store an executed action (D,), environment units, and the end effector's position (3,) after it, metres."""
         self._executed = np.concatenate([self._executed, self.space.normalise(action)[None]])[-WINDOW:]
-        self.path.append(np.asarray(end_effector))
+        self.path = np.concatenate([self.path, [end_effector]])
         del self.planned[:1]
 
     def starts(self, planned: Sequence[np.ndarray], dropped: int) -> None:

@@ -188,7 +188,7 @@ class Decoder(Follower):
     def _new_chunk(self, prompt: Tensor | Callable[[], Tensor]) -> Chunk:
         self.cache.length, choice, boundary = 0, None, self.parts.boundary
         if boundary is not None:
-            choice = boundary.choose(np.array(self.path))
+            choice = boundary.choose(self.path)
         self.r = self.threshold.radius()
         limits = self.acceptance.limits(self.r)
         target = TargetSide(prompt if callable(prompt) else lambda: prompt, self.cache)
