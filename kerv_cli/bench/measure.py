@@ -49,7 +49,7 @@ _EVICTING = 16 * 2**20  # float32 numbers that are read before each decode, to e
 _TREE = (5, 8, 50)  # depth, children, nodes of EAGLE-2's tree
 _MERGED = 30  # nodes of a merged in-prefill draft
 _TASK = "reach-v3"
-_LAUNCH = re.compile(r"cu(da)?(LaunchKernel|GraphLaunch|Memcpy|Memset)")
+_LAUNCH = re.compile(r"cu(da)?(Launch(Cooperative)?Kernel|GraphLaunch|Memcpy|Memset)")
 Key = tuple[str, int]  # the attributes `kind` and `rows` of a `Phase`
 Lap = tuple[str, float]  # phase of a decode, as in `engine.record.PHASES`, and its seconds
 
@@ -291,8 +291,12 @@ def measure(model: Model, settings: BenchSettings) -> list[Phase]:
     return list(phases_of(seconds, model.sizes, machine))
 
 
+@torch.inference_mode()
 def launches_per_token(model: Model) -> float | None:
-    """Count the calls that start work on the GPU in one autoregressive decode, per token. None on a CPU."""
+    """Count the calls that start work on the GPU in one autoregressive decode, per token.
+
+    None on a CPU, and where PyTorch's profiler sees no calls.
+    """
     if model.target.device.type == "cpu":
         return None
     decoder, prompt = Decoder(model.target), model.target.encode(model.observation)
@@ -300,7 +304,7 @@ def launches_per_token(model: Model) -> float | None:
     with torch.profiler.profile() as profiler:
         chunk = decoder.decode_prompt(prompt)
         torch.cuda.synchronize()
-    return launches(event.name for event in profiler.events()) / len(chunk.tokens)
+    return launches(event.name for event in profiler.events()) / len(chunk.tokens) or None
 
 
 def launches(calls: Iterable[str]) -> int:

@@ -295,6 +295,6 @@ class Chunk:
 
 
 def check_tokens(tokens: Sequence[int], vocabulary: int, proposer: str) -> None:
-    if tokens and not (min(tokens) >= 0 and max(tokens) < vocabulary):
+    if len(tokens) and not (min(tokens) >= 0 and max(tokens) < vocabulary):
         wrong = next(token for token in tokens if not 0 <= token < vocabulary)
         raise KervError(f"the proposer '{proposer}' drafted token {wrong}: tokens are 0 to {vocabulary - 1}")

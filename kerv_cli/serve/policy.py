@@ -142,7 +142,7 @@ class Policy:
 
 
 class Finite:
-    """Wraps a target, and checks whether all numbers in the target's prompts and logits are finite."""
+    """Wraps a target, and checks whether the numbers in its prompts and in the prefill's logits are finite."""
 
     def __init__(self, target: Target) -> None:
         self._target = target
@@ -162,7 +162,7 @@ class Finite:
         return numbers
 
     def check(self) -> None:
-        """Check all prompts and logits since the last call."""
+        """Check all noted numbers since the last call."""
         fine, self._fine = self._fine, []
         if fine and not bool(torch.stack(fine).all()):
             raise KervError("the policy computed numbers that are not finite: no action is sent")

@@ -284,7 +284,7 @@ def sum_of_exponentials(x, most):
 
 @compiled
 def choose(frame, columns, numbers):
-    """Choose the tokens of a chunk, and estimate the probability that all are accepted, like `early.drafter.choose`.
+    """Choose the tokens of a chunk, and estimate the probability that all are accepted, like `early.network.choose`.
 
     `frame` (size,) holds the logits, and afterwards the result. `numbers` holds 1 for each token that must equal the
     target's token, else 0.

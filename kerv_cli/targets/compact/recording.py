@@ -125,7 +125,7 @@ class Recorded:
         return out[:1], out[1:].view(hidden.shape)
 
     def choose(self, radius: Recorded, strict: Tensor) -> Recorded:
-        """Record the choice of a chunk's tokens from the logits `self` (1, N, V), see `early.drafter.choose`.
+        """Record the choice of a chunk's tokens from the logits `self` (1, N, V), see `early.network.choose`.
 
         Args:
             radius: (1, 1) acceptance radius, in bins.
