@@ -211,7 +211,8 @@ class Program:
                 block = frames[:, first : first + shape[-1]]
             else:
                 block = frames[:, first : first + rows * stride].reshape(len(frames), rows, stride)[:, :, : shape[-1]]
-            found.append(torch.from_numpy(np.ascontiguousarray(block)).view(-1, *shape))
+                block = np.ascontiguousarray(block)
+            found.append(torch.from_numpy(block).view(-1, *shape))
         return found
 
     def repeat(self, times: int, *inputs: Tensor, cache: Cache, end: int | None = None) -> np.ndarray:
