@@ -50,7 +50,8 @@ for name in Command.every():
     for words in ("--help", "--cfg", "nonsense.key=1"):
         CliRunner().invoke(app, [*name.split(), words])
         loads("torch mujoco pandas sqlalchemy", by=f"kerv {{name}} {{words}}")
-plan = CliRunner().invoke(app, ["sweep", "study=main", "episodes=1", "runtime.device=cpu", "results=" + sys.argv[1], "--plan"])
+words = ["study=main", "episodes=1", "runtime.device=cpu", "results=" + sys.argv[1]]
+plan = CliRunner().invoke(app, ["sweep", *words, "--plan"])
 assert "140 episodes to run" in plan.output, plan.output
 loads("torch mujoco pandas rerun", by="a plan")
 import kerv_cli.board.app, kerv_cli.report.report

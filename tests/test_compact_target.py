@@ -28,10 +28,10 @@ from kerv_cli.methods.unverified import ParallelPass
 from kerv_cli.targets.attention import SIZES, CapturedCache
 from kerv_cli.targets.checkpoint import load_target
 from kerv_cli.targets.compact.features import WordTokenizer, places_of, privileged_features, scene_features, scene_width
+from kerv_cli.targets.compact.growth import grow_stack
 from kerv_cli.targets.compact.program import compile_parts
 from kerv_cli.targets.compact.target import CompactTarget, Inputs, save_target
 from kerv_cli.targets.compact.trunk import Trunk
-from kerv_cli.targets.grown import grow_stack
 from kerv_cli.targets.settings import GrowSettings, TargetSettings
 from kerv_cli.training.settings import TrainTargetSettings
 from kerv_cli.training.target import check_init, continued_target
