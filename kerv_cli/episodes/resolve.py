@@ -84,8 +84,8 @@ class ResolvedStudy:
     @property
     def unseen(self) -> dict[str, list[str]]:
         found: dict[str, list[str]] = {}
-        for one in self.settings.values():
-            trained = () if one.policy.target in found else trained_tasks(one)
+        for one in {one.policy.target: one for one in self.settings.values()}.values():
+            trained = trained_tasks(one)
             if unseen := [task for task in self.tasks if trained and task not in trained]:
                 found[one.policy.target] = unseen
         return found
