@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from kerv_cli.base.errors import CheckpointError, UsageError
 from kerv_cli.base.manifests import read
 from kerv_cli.base.spaces import ActionSpace, Observation, ObservationSpace
-from kerv_cli.engine.draft import upload
+from kerv_cli.engine.draft import HOST, upload
 from kerv_cli.engine.protocol import Seen
 from kerv_cli.targets.attention import Cache, CapturedCache
 from kerv_cli.targets.checkpoint import FLOAT32, TargetDescription, save_module, target_fields
@@ -67,6 +67,7 @@ class Programs(NamedTuple):
 
     prompt: Program
     step: Program
+    dtype: torch.dtype
 
 
 class CompactTarget(Compilable):
@@ -146,7 +147,8 @@ class CompactTarget(Compilable):
 
     @property
     def device(self) -> torch.device:
-        return self.head.weight.device
+        # asked several times per round; a module finds its parts slowly
+        return HOST if self.compiled is not None else self.head.weight.device
 
     @property
     def layers(self) -> nn.ModuleList:
@@ -154,7 +156,7 @@ class CompactTarget(Compilable):
 
     @property
     def dtype(self) -> torch.dtype:
-        return self.head.weight.dtype
+        return self.compiled.dtype if self.compiled is not None else self.head.weight.dtype
 
     def inputs(self, observation: Observation) -> Inputs:
         device = self.device
@@ -251,7 +253,7 @@ class CompactTarget(Compilable):
             hidden = self.trunk.recorded(self.embedding(token))
             return self.head(hidden).argmax(-1)[None], hidden
 
-        return Programs(Program(self.prompt, *shapes), Program(step, (1, 1), repeats=True))
+        return Programs(Program(self.prompt, *shapes), Program(step, (1, 1), repeats=True), self.head.weight.dtype)
 
     def join(self, function: Callable[..., Any], *shapes: tuple[int, ...], repeats: bool = False) -> Program | None:
         return Program(function, *shapes, repeats=repeats) if self.compiled is not None else None
