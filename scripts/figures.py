@@ -8,7 +8,7 @@ committed.
     <!-- figure main one_pass speedup -->2.04 (1.97–2.11)<!-- /figure -->      one number within a sentence
 
 A study's name is that of `results/tables/<study>.csv`. Behind it `only=a,b` takes these settings, which are written
-with `_` for a space. A column `NAME@OTHER` is that of the same setting elsewhere. OTHER is a table, OTHER.csv, or a
+with `_` for a space. A column `NAME@OTHER` takes NAME of the same setting from OTHER, a table, OTHER.csv, or a
 machine, for which `<study>_on.csv` has prices, or TABLE:MACHINE, for which `TABLE_on.csv` has them. Behind a column,
 `=TITLE` is its heading, with `_` for a space.
 """

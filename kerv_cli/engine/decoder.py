@@ -104,7 +104,7 @@ class Decoder(Follower):
     def __init__(self, target: Target, parts: Parts | None = None, chunk: int = 0) -> None:
         super().__init__(target.actions, target.cameras)
         self.target, self.device, self.parts = target, target.device, parts or Parts()
-        self.predicts = target if isinstance(target, PredictsTokens) else None
+        self.predicts: PredictsTokens | None = target if isinstance(target, PredictsTokens) else None
         self.continues = target if isinstance(target, ContinuesGreedily) else None
         self.steps = chunk_steps(chunk, target.chunk)
         self.acceptance: DistanceRule = self.parts.acceptance or StrictRule(target.actions)
@@ -243,8 +243,11 @@ class Decoder(Follower):
         positions = torch.arange(first, first + chunk.remaining, device=self.device).split(1)
         tokens = [upload(chunk.tokens[-1:], self.device)]
         for position in positions:
-            hidden = target.forward(target.embed(tokens[-1][None]), position, cache)
-            tokens.append(target.head(hidden)[0].argmax(-1))
+            if self.predicts is not None:
+                tokens.append(self.predicts.predict(tokens[-1], position, cache, None)[0])
+            else:
+                hidden = target.forward(target.embed(tokens[-1][None]), position, cache)
+                tokens.append(target.head(hidden)[0].argmax(-1))
             stopwatch.lap("verify")
             if self.space.end is not None and int(tokens[-1]) == self.space.end:
                 break

@@ -42,11 +42,11 @@ WARM_UP_DECODES = 6
 
 def artifacts_of(settings: Any) -> Artifacts:
     """Return the artifacts of a command's `results` and `policy`, for its `runtime`, which is set up."""
-    device, _ = set_up(settings.runtime)
-    return Artifacts(settings.results, settings.policy, device, settings.runtime.dtype)
+    set_up(settings.runtime)
+    return _described(settings)
 
 
-def _described(settings: RolloutSettings) -> Artifacts:
+def _described(settings: Any) -> Artifacts:
     # to read descriptions alone, which needs no torch
     return Artifacts(settings.results, settings.policy, device_of(settings.runtime), settings.runtime.dtype)
 

@@ -17,7 +17,7 @@ from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.registry import ArtifactPart
 from kerv_cli.base.spaces import Observation
 from kerv_cli.engine.decoder import Decoder
-from kerv_cli.engine.protocol import Target
+from kerv_cli.engine.protocol import Seen, Target
 from kerv_cli.engine.record import DecodeRecord
 from kerv_cli.episodes.identity import work_of
 from kerv_cli.episodes.policy import artifacts_of, warm_up
@@ -101,6 +101,8 @@ class Policy:
         with self._turn:
             decoder = self.method.decoder(self.artifacts.target, self.artifacts.load, task)
             decoder.target = Finite(decoder.target)
+            if decoder.predicts is not None:
+                decoder.predicts = decoder.target
             warm_up(decoder, task, self.interface.observation, self.interface.size, WARM_UP)
         return decoder
 
@@ -142,10 +144,13 @@ class Policy:
 
 
 class Finite:
-    """Wraps a target, and checks whether the numbers in its prompts and in the prefill's logits are finite."""
+    """Wraps a target, and checks whether its prompts, and its logits or hidden states, are finite.
+
+    Tokens that `continue_greedily` decodes in one call are not checked.
+    """
 
     def __init__(self, target: Target) -> None:
-        self._target = target
+        self._target: Any = target
         self._fine: list[Tensor] = []  # read once per decode, so that no forward waits for the device
 
     def __getattr__(self, name: str) -> Any:
@@ -156,6 +161,10 @@ class Finite:
 
     def head(self, hidden: Tensor) -> Tensor:
         return self._noted(self._target.head(hidden))
+
+    def predict(self, tokens: Tensor, positions: Tensor, cache: Any, seen: Seen) -> tuple[Tensor, Tensor]:
+        found, hidden = self._target.predict(tokens, positions, cache, seen)
+        return found, self._noted(hidden)
 
     def _noted(self, numbers: Tensor) -> Tensor:
         self._fine.append(torch.isfinite(numbers).all())

@@ -179,7 +179,7 @@ class CapturedCache(Cache):
         self.steps: dict[int, _Step] = {}
 
     def run(self, compute: Compute, x: Tensor, positions: Tensor, seen: Seen) -> Tensor:
-        """Return the result (1, T, E) of `compute`. The next forward in the same graph overwrites `predicted`.
+        """Return the result (1, T, E) of `compute`, and set `predicted`.
 
         Args:
             x: (1, T, width) input of the first layer.
@@ -251,5 +251,5 @@ class _Step:
         if self.graph is not None:
             self.graph.replay()
         hidden, predicted = self.out if self.graph is not None else self._compute()
-        # a copy: callers keep it, and the next forward in this graph overwrites the original
-        return hidden[:, :tokens].clone(), predicted[:, :tokens] if predicted is not None else None
+        # copies: callers keep them, and the next forward in this graph overwrites the originals
+        return hidden[:, :tokens].clone(), predicted[:, :tokens].clone() if predicted is not None else None

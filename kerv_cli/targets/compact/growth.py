@@ -39,7 +39,7 @@ def grow_stack(stack: LayerStack, shape: GrowSettings, layers: int) -> None:
 
 
 def _grown_layer(old: Layer | None, stack: LayerStack, shape: GrowSettings, generator: torch.Generator) -> Layer:
-    # the output equals that of `old`, or the input if `old` is None
+    # computes the same output as `old`; without `old` the output is the input
     new = Layer(shape.width, shape.heads, shape.feed_forward)
     width, channels, wide = stack.width, stack.width // stack.heads, shape.width // shape.heads
     with torch.no_grad():

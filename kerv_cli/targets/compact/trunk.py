@@ -151,9 +151,8 @@ class LayerStack(Compilable):
         elif self.runs_compiled(x):
             hidden = self.compiled(*inputs, positions=positions, cache=cache, seen=seen)[0].view(x.shape).to(x.dtype)
         else:
-            mask, slots = attention_mask(seen, x.shape[1], cache, x), None
-            if cache is not None:
-                slots = cache.next_slots(x.shape[1])
+            mask = attention_mask(seen, x.shape[1], cache, x)
+            slots = cache.next_slots(x.shape[1]) if cache is not None else None
             hidden = self.forwarded(self.begin(*inputs), positions, cache, slots, mask)
         if cache is not None:
             cache.length += tokens  # the next forward overwrites the padding
