@@ -5,7 +5,6 @@ Shapes: D degrees of freedom of an action, N tokens of a chunk, P prompt tokens,
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,7 +14,7 @@ import numpy as np
 
 from kerv_cli.base.errors import KervError, UsageError
 from kerv_cli.base.spaces import ActionSpace, Observation
-from kerv_cli.engine.decisions import ROOT, Choice, Judged, Rectified, SkipDecision
+from kerv_cli.engine.decisions import Choice, Judged, Rectified, SkipDecision
 from kerv_cli.engine.record import PARALLEL, DecodeRecord, Round, variability
 
 if TYPE_CHECKING:
@@ -180,31 +179,6 @@ class Chunk:
     @property
     def compensated(self) -> int:
         return len(self.filled) if self.closed is None else max(0, self.closed.size - len(self.tokens))
-
-    def distance(self, tokens: Sequence[int], others: Sequence[int]) -> float:
-        """Return the mean absolute difference of two token sequences from the chunk's start, normalised units.
-
-        The result is infinite if the sequences differ in a strict DoF, such as a gripper.
-        """
-        first, second = np.array(tokens), np.array(others)
-        if (first != second)[self.space.strict_tokens(len(first))].any():
-            return math.inf
-        return float(np.abs(self.space.values_of(first) - self.space.values_of(second)).mean())
-
-    def targets_along(self, chain: Sequence[int]) -> list[int] | None:
-        """Return the target's predictions along a chain of the prefill draft. Call this in the prefill's round only.
-
-        Returns N tokens; the last follows the draft's N − 1. None if the prefill verified fewer tokens of this chain.
-        """
-        tree, target_tokens, _ = self.judged
-        nodes = {pair: node for node, pair in enumerate(zip(tree.parents, tree.tokens, strict=True))}
-        node, targets = ROOT, list[int]()
-        for token in chain:
-            targets.append(target_tokens[node + 1])
-            if (node, token) not in nodes:
-                break
-            node = nodes[node, token]
-        return targets if len(targets) == self.size else None
 
     @cached_property
     def variability(self) -> float | None:

@@ -23,7 +23,7 @@ from kerv_cli.engine.decisions import Judged, TokenTree
 from kerv_cli.engine.draft import EMPTY, Draft, read, upload
 from kerv_cli.engine.parts import Boundary, Fixed, Rectifier, Skip, Threshold
 from kerv_cli.engine.proposer import Proposer
-from kerv_cli.engine.protocol import ContinuesGreedily, PredictsTokens, Target
+from kerv_cli.engine.protocol import ContinuesGreedily, PredictsTokens, Seen, Target
 from kerv_cli.engine.record import MEAN, PHASES, DecodeRecord, Round, variability
 
 
@@ -238,20 +238,21 @@ class Decoder(Follower):
 
         If an end token can end the chunk, the CPU reads each token right after its forward.
         """
-        target, cache = self.target, chunk.target.cache
-        first = cache.length
+        cache, first = chunk.target.cache, chunk.target.cache.length
         positions = torch.arange(first, first + chunk.remaining, device=self.device).split(1)
         tokens = [upload(chunk.tokens[-1:], self.device)]
         for position in positions:
-            if self.predicts is not None:
-                tokens.append(self.predicts.predict(tokens[-1], position, cache, None)[0])
-            else:
-                hidden = target.forward(target.embed(tokens[-1][None]), position, cache)
-                tokens.append(target.head(hidden)[0].argmax(-1))
+            tokens.append(self.predict(tokens[-1], position, cache, None)[0])
             stopwatch.lap("verify")
             if self.space.end is not None and int(tokens[-1]) == self.space.end:
                 break
         return torch.cat(tokens[1:]).tolist()
+
+    def predict(self, tokens: Tensor, positions: Tensor, cache: Any, seen: Seen) -> tuple[Tensor, Tensor]:
+        if self.predicts is not None:
+            return self.predicts.predict(tokens, positions, cache, seen)
+        hidden = self.target.forward(self.target.embed(tokens[None]), positions, cache, seen)
+        return self.target.head(hidden[0]).argmax(-1), hidden
 
     def propose(self, chunk: Chunk, proposer: Proposer | None, stopwatch: Stopwatch) -> Draft:
         if proposer is None or chunk.remaining < 2:
@@ -267,13 +268,13 @@ class Decoder(Follower):
         target, cache, uncached = self.target, chunk.target.cache, chunk.target.uncached(chunk.tokens)
         before = len(uncached) or chunk.target.prompt_length
         positions, seen = draft.positions(cache.length, before, self.device), draft.visible(before)
-        x = draft.tokens_after(uncached, self.device) if uncached or len(draft) else None
-        if x is not None and uncached and self.predicts is not None:
-            found, hidden = self.predicts.predict(x, positions, cache, seen)
+        if uncached:
+            found, hidden = self.predict(draft.tokens_after(uncached, self.device), positions, cache, seen)
             predicted = found[before - 1 :]
         else:
-            x = chunk.target.prompt if x is None else target.embed(x[None])
-            x = x if uncached or not len(draft) else torch.cat([chunk.target.prompt, x], 1)
+            x = chunk.target.prompt
+            if len(draft):
+                x = torch.cat([x, target.embed(draft.tokens_after([], self.device)[None])], 1)
             hidden = target.forward(x, positions, cache, seen)
             predicted = target.head(hidden[0, before - 1 :]).argmax(-1)
         # nowhere else in a round does the CPU wait for the GPU

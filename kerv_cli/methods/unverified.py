@@ -7,15 +7,20 @@ always      every draft (§6)
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from kerv_cli.base.limits import number
 from kerv_cli.base.registry import NoSettings, SkipPart
-from kerv_cli.engine.decisions import SkipDecision
+from kerv_cli.engine.decisions import ROOT, SkipDecision
 from kerv_cli.engine.parts import Skip
 
 if TYPE_CHECKING:
+    from kerv_cli.base.spaces import ActionSpace
     from kerv_cli.engine.chunk import Chunk
     from kerv_cli.engine.decoder import Decoder
     from kerv_cli.engine.proposer import ChainProposer
@@ -103,13 +108,40 @@ class StreakSkip(Skip):
         return SkipDecision(self.chain, self.source.name, TRUSTED)
 
     def verified(self, chunk: Chunk) -> None:
-        targets, tolerance, agrees = chunk.targets_along(self.chain), self.settings.tolerance, False
+        targets, tolerance, agrees = targets_along(chunk, self.chain), self.settings.tolerance, False
         if targets is not None:
             # the draft leaves out the chunk's last token, such as a gripper, which is judged here
             accepted, last = chunk.rounds[0].drafted[: chunk.rounds[0].accepted], abs(self.chain[-1] - targets[-1])
             whole = accepted == self.chain[:-1] and last <= chunk.limits[-1]
-            agrees = whole or (tolerance > 0 and chunk.distance(self.chain, targets) <= tolerance)
+            agrees = whole or (tolerance > 0 and distance(self.chain, targets, chunk.space) <= tolerance)
         self.allowed = self.left = min(self.settings.most, 2 * self.allowed or 1) if agrees else 0
+
+
+def targets_along(chunk: Chunk, chain: Sequence[int]) -> list[int] | None:
+    """Return the target's N predictions along a chain of N tokens, from the verification of the prefill draft.
+
+    None if fewer than N − 1 tokens of this chain were verified.
+    """
+    tree, target_tokens, _ = chunk.judged
+    nodes = {pair: node for node, pair in enumerate(zip(tree.parents, tree.tokens, strict=True))}
+    node, targets = ROOT, list[int]()
+    for token in chain:
+        targets.append(target_tokens[node + 1])
+        if (node, token) not in nodes:
+            break
+        node = nodes[node, token]
+    return targets if len(targets) == chunk.size else None
+
+
+def distance(tokens: Sequence[int], others: Sequence[int], space: ActionSpace) -> float:
+    """Return the mean absolute difference of two chunks of tokens, normalised action units.
+
+    The result is infinite if the chunks differ in a strict DoF, such as a gripper.
+    """
+    first, second = np.array(tokens), np.array(others)
+    if (first != second)[space.strict_tokens(len(first))].any():
+        return math.inf
+    return float(np.abs(space.values_of(first) - space.values_of(second)).mean())
 
 
 @SkipPart("always", takes_draft=True, verifies=False, any_code=True)
