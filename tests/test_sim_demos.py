@@ -1,6 +1,7 @@
 """Recorded demonstrations on real Meta-World: contents, resuming, refusals, damage, frames that stay encoded."""
 
 import hashlib
+import itertools
 import json
 import shutil
 import tracemalloc
@@ -16,7 +17,7 @@ from examples.insertion import SPEC as INSERTION
 from kerv_cli.base.errors import CheckpointError, KervError, UsageError
 from kerv_cli.base.manifests import read_file
 from kerv_cli.targets.compact.features import WordTokenizer
-from kerv_cli.targets.observations import Observations, read_observations
+from kerv_cli.targets.observations import Observations, read_observations, undisturbed
 from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.worlds.demos import recording
 from kerv_cli.worlds.demos.dataset import DemoDataset, DemoManifest
@@ -164,6 +165,34 @@ def test_noise_is_what_it_was_in_every_dataset_so_far():
     perturb = Perturbation("reach-v3", 1, SPEC.actions)
     executed = np.array([perturb(np.array([0.1, -0.2, 0.3, -1.0])) for _ in range(200)])
     assert hashlib.sha256(executed.tobytes()).hexdigest() == GOLDEN_NOISE
+
+
+@pytest.mark.parametrize("quiet", [1, 20])
+def test_quiet_noise_comes_in_bursts_that_far_apart(quiet):
+    action = np.array([0.1, -0.2, 0.3, -1.0])
+    for seed in range(20):
+        perturb = Perturbation("reach-v3", seed, SPEC.actions, quiet)
+        noisy = [(perturb(action) != action).any() for _ in range(300)]
+        lengths = [len(list(run)) for _, run in itertools.groupby(noisy)]  # noisy and quiet stretches in turn
+        whole = lengths[1:-1]  # the first begins at random, the last is cut off
+        stretches = dict(zip((noisy[lengths[0]], not noisy[lengths[0]]), (whole[::2], whole[1::2]), strict=True))
+        assert set(stretches[False]) == {quiet}
+        assert set(stretches[True]) <= set(range(3, 9))
+
+
+def test_only_chunks_executed_as_labelled_are_undisturbed(tmp_path):
+    config, chunk = replace(CONFIG, tasks=("drawer-close",), episodes=2, perturbed=1.0, quiet=8), 5
+    record(config, tmp_path)
+    dataset = DemoDataset.open(tmp_path)
+    for index in range(2):
+        episode = dataset.load(index)
+        executed = np.concatenate([episode.executed, episode.labels[episode.steps :]])
+        steps = np.arange(episode.steps)
+        expected = [bool((executed[t : t + chunk] == episode.labels[t : t + chunk]).all()) for t in steps]
+        assert undisturbed(episode, steps, chunk).tolist() == expected
+        assert 0 < sum(expected) < len(steps)
+    with pytest.raises(UsageError, match="quiet=8, not None"):
+        record(replace(config, quiet=0), tmp_path)
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.3, 0.5, 1.0])

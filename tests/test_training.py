@@ -234,6 +234,16 @@ def test_a_run_learns_the_experts_own_path(results):
     assert "waypoint_1_error_cm" in out
     assert "object_error_cm" not in out
     assert "waypoint" not in kerv(*words, "name=none", "train.scene_weight=0").stdout
+    assert "waypoint" in kerv(*words, "name=calm", "train.undisturbed=true").stdout
+
+
+@pytest.mark.usefixtures("quick_training")
+def test_demonstrations_that_are_all_disturbed_name_the_remedy(results, monkeypatch):
+    monkeypatch.setattr(
+        "kerv_cli.training.target.undisturbed", lambda episode, steps, chunk: np.zeros(len(steps), bool)
+    )
+    words = ["target=nano", "task=drawer-close", "demos=few", "name=none-left", f"results={results}"]
+    assert "quiet=8" in refusal("train", "target", *words, "train.undisturbed=true", "target.chunk=4", code=1)
 
 
 @pytest.mark.usefixtures("quick_training")

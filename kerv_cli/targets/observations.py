@@ -83,6 +83,16 @@ def read_chunks(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarr
     return episode.labels[steps[:, None] + np.arange(chunk)]
 
 
+def undisturbed(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarray:
+    """Return whether all actions of the chunks that begin at the control steps (n,) were executed as labelled, (n,).
+
+    Noise in the execution changes the later labels of a chunk, so no policy can predict them.
+    """
+    noisy = np.zeros(len(episode.labels), dtype=bool)  # after an episode's end the expert acts
+    noisy[: episode.steps] = (episode.executed != episode.labels[: episode.steps]).any(1)
+    return np.asarray(~noisy[steps[:, None] + np.arange(chunk)].any(1))
+
+
 def observations_of(
     target: Target, episode: DemoEpisode, steps: np.ndarray, space: ObservationSpace
 ) -> list[Observation]:

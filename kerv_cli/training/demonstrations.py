@@ -260,6 +260,7 @@ def recording_of(settings: DemosSettings) -> tuple[DemoConfig, PolicyActs | None
         episodes=settings.episodes,
         first_seed=settings.seed,
         perturbed=settings.perturbed,
+        quiet=settings.quiet,
         camera=settings.world.camera,
         frame_stride=settings.frame_stride,
         tail=settings.tail,

@@ -250,6 +250,8 @@ def identity_of(train: TrainSettings, dataset: DemoDataset, **own: Any) -> str:
     counted = {key: value for key, value in asdict(train).items() if key not in NOT_IDENTITY}
     if train.stored == "float32":  # left out, so that trainings from before it counted can be resumed
         del counted["stored"]
+    if not train.undisturbed:
+        del counted["undisturbed"]
     counted["closed_loop"] = train.closed_loop > 0  # scores with and without success cannot be compared
     return hash_of({"train": counted, "demos": dataset.sha256, **own})
 

@@ -91,6 +91,7 @@ class TrainSettings:
     scene_steps: int = number(0, 0, 10**9, help="first steps, which train only the vision encoder, on positions")
     held_out: float = number(0.1, above=0, most=0.5, help="share of episodes kept for validation")
     validate_every: int = number(2_000, 1, 10**9, help="steps between two validations")
+    undisturbed: bool = setting(False, "train only on chunks whose actions were all executed without noise")
     closed_loop: int = number(0, 0, 100_000, help="simulated episodes per task at every validation; 0: none")
     seed: int = number(0, 0, 2**31 - 1, help="seed of the initial weights and of the order of samples")
     bf16: bool = setting(True, "train in bfloat16 on a GPU or a CPU with AMX or AVX512-BF16; else float32")
@@ -128,6 +129,7 @@ class DemosSettings(MethodSettings, TaskSettings):
     episodes: int = number(100, 1, 100_000, help="episodes per task")
     seed: int = number(0, 0, 2**31 - 1, help="first seed of every task; must be a training seed")
     perturbed: float = number(0.5, 0, 1, help="share of episodes in which the expert is disturbed")
+    quiet: int = number(0, 0, 10_000, help="control steps between two disturbances; 0: noise in every step")
     expert_share: float = number(0.3, 0, 1, help="if a policy acts: share of chunks in which the expert acts instead")
     frame_stride: int = number(2, 1, 10_000, help="control steps between two stored images")
     tail: int = number(8, 0, 1024, help="control steps recorded after the success, for chunks that begin near it")
@@ -160,7 +162,7 @@ class TrainDrafterSettings(DemonstrationSettings):
     train: TrainSettings = setting(TrainSettings, "optimisation")
 
     def check_together(self, prefix: str) -> None:
-        unused = ("init", "balance", "closed_loop", "colour", "places")
+        unused = ("init", "balance", "undisturbed", "closed_loop", "colour", "places")
         refuse_unused(self.train, unused, ": only the training of a target has this setting")
 
 

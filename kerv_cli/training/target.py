@@ -33,7 +33,7 @@ from kerv_cli.targets.checkpoint import TargetDescription, load_target, read_tar
 from kerv_cli.targets.compact.features import WordTokenizer, places_of
 from kerv_cli.targets.compact.target import CompactTarget, save_target
 from kerv_cli.targets.losses import labels_of, position_loss, token_loss, within_chunk
-from kerv_cli.targets.observations import Observations, read_chunks, read_observations
+from kerv_cli.targets.observations import Observations, read_chunks, read_observations, undisturbed
 from kerv_cli.targets.samples import split
 from kerv_cli.targets.settings import TargetSettings
 from kerv_cli.training import fit
@@ -103,8 +103,8 @@ def plan_target(settings: TrainTargetSettings, database: Database) -> Plan[tuple
         return target, lambda step: imitation.loss(draw(step), step), imitation.validate, write
 
     def seconds() -> float:
-        # from a few steps on demonstrations of one task
-        chosen = dataset.of_tasks(tasks[0])[: fit.FEW]
+        # from a few steps on demonstrations of one task, undisturbed ones first
+        chosen = sorted(dataset.of_tasks(tasks[0]), key=lambda index: dataset.episodes[index].perturbed)[: fit.FEW]
         few = replace(dataset, episodes=[dataset.episodes[index] for index in chosen])
         target, loss, *_ = ready(few, lambda *done: None)
         return fit.seconds_of(loss, train, next(target.parameters()).device)
@@ -178,7 +178,13 @@ def load_training(
     elif not observation.places:
         observation = observation.without_state(WAYPOINTS)
     waypoints = len(observation.places) if settings.train.places == "path" else 0
-    samples = load_samples(dataset, shapes, words, resolve_tasks(settings.task), progress, waypoints)
+    tasks, undisturbed_only = resolve_tasks(settings.task), settings.train.undisturbed
+    samples = load_samples(dataset, shapes, words, tasks, progress, waypoints, undisturbed_only)
+    if not len(samples):
+        raise CheckpointError(
+            f"every chunk in {dataset.path} was disturbed: record with quiet={2 * shapes.chunk}, "
+            "or leave train.undisturbed out"
+        )
     torch.manual_seed(settings.train.seed)
     if old is None:
         actions = manifest.actions.fitted(samples.chunks[:, 0].numpy().astype(np.float64))
@@ -215,12 +221,16 @@ def load_samples(
     task_names: tuple[str, ...],
     progress: OnProgress = lambda done, total: None,
     waypoints: int = 0,
+    undisturbed_only: bool = False,
 ) -> Samples:
     chosen = dataset.of_tasks(*task_names)
     parts = []
     for number, index in enumerate(chosen):
         episode = dataset.load(index)
         observations = read_observations(episode, settings, dataset.manifest.observation, words)
+        if undisturbed_only:
+            kept = undisturbed(episode, observations.steps.numpy(), settings.chunk)
+            observations = observations.where(torch.from_numpy(kept))
         steps, count = observations.steps.numpy(), len(observations)
         if waypoints:
             learnt = waypoints_of(episode, steps, waypoints, dataset.manifest.actions)

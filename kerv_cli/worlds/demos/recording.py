@@ -53,6 +53,8 @@ class DemoConfig:
     first_seed: int = 0  # first seed of every task. It must be a training seed.
     # share of episodes that are executed with noise. `is_perturbed` chooses these episodes.
     perturbed: float = number(0.5, 0, 1)
+    # 0: noise in every control step. Else only bursts of noise, each followed by this many control steps without noise.
+    quiet: int = number(0, 0)
     camera: CameraSettings = field(default_factory=CameraSettings)
     frame_stride: int = number(1, 1)  # record an image at every n-th control step
     # number of labels to record after the success. Action chunks that begin near the end need them.
@@ -94,7 +96,7 @@ def run_expert(world: World, seed: int, config: DemoConfig, actor: Any) -> DemoE
         actor.reset(world, seed)
         act = actor.act
     elif noisy:
-        act = Perturbation(world.task, seed, world.spec.actions)
+        act = Perturbation(world.task, seed, world.spec.actions, config.quiet)
     states, labels, executed, frames, frame_steps = [], [], [], [], []
     last_step = min(config.horizon, world.horizon - config.tail)
     while not world.success and world.steps < last_step:
@@ -172,6 +174,8 @@ def record(
 def _identity(config: DemoConfig) -> dict[str, Any]:
     settings = asdict(config) | {"noise_low": SIGMA[0], "noise_high": SIGMA[1], "burst_probability": BURST_PROBABILITY}
     del settings["workers"]
+    if not config.quiet:  # left out, so that recordings from before it existed can be resumed
+        del settings["quiet"]
     spec = config.spec
     experts = {task: spec.experts[task] for task in config.tasks if task in spec.experts}
     if experts:
@@ -264,27 +268,34 @@ class Perturbation:
     """Adds noise to the actions (D,) of one episode. The noisy actions stay within the limits.
 
     The noise is Gaussian. Now and then, for 3 to 8 control steps, a burst in one random direction replaces the action.
+    With `quiet` there is no Gaussian noise, and a burst begins `quiet` control steps after the end of the last one.
     Strict DoFs (such as a gripper) are not changed.
     """
 
-    def __init__(self, task: str, seed: int, space: ActionSpace) -> None:
+    def __init__(self, task: str, seed: int, space: ActionSpace, quiet: int = 0) -> None:
         self._random = np.random.default_rng([seed, *task.encode()])
-        self.sigma = float(self._random.uniform(*SIGMA))
+        self.sigma = 0.0 if quiet else float(self._random.uniform(*SIGMA))
+        self.quiet = quiet
         self._burst_left = 0
+        self._quiet_left = int(self._random.integers(quiet)) if quiet else 0
         self._noisy = ~space.is_strict
         self._low, self._high = np.array(space.low)[self._noisy], np.array(space.high)[self._noisy]
         self._half, self._middle = space.half[self._noisy], space.middle[self._noisy]
         self._direction = np.zeros(len(self._half))  # normalised
 
     def __call__(self, action: NDArray[np.float64]) -> NDArray[np.float64]:
+        if self._quiet_left > 0:
+            self._quiet_left -= 1
+            return action
         dofs = len(self._half)
         noise = self._random.normal(0.0, self.sigma, size=dofs)
-        if self._burst_left == 0 and self._random.random() < BURST_PROBABILITY:
+        if self._burst_left == 0 and (self.quiet or self._random.random() < BURST_PROBABILITY):
             self._burst_left = int(self._random.integers(3, 9))
             self._direction = unit_vector(self._random, dofs)
         moved = action[self._noisy] + noise * self._half
         if self._burst_left > 0:
             self._burst_left -= 1
+            self._quiet_left = 0 if self._burst_left else self.quiet
             moved = self._direction * self._half + self._middle
         executed = action.copy()
         executed[self._noisy] = np.clip(moved, self._low, self._high)
