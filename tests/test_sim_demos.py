@@ -191,7 +191,9 @@ def test_only_chunks_executed_as_labelled_are_undisturbed(tmp_path):
         expected = [bool((executed[t : t + chunk] == episode.labels[t : t + chunk]).all()) for t in steps]
         assert undisturbed(episode, steps, chunk).tolist() == expected
         assert 0 < sum(expected) < len(steps)
-    with pytest.raises(UsageError, match="quiet=8, not None"):
+    with pytest.raises(CheckpointError, match="take at most 6"):
+        undisturbed(dataset.load(0), np.arange(3), CONFIG.tail + 2)
+    with pytest.raises(UsageError, match="quiet=8, not 0"):
         record(replace(config, quiet=0), tmp_path)
 
 

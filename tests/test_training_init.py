@@ -104,6 +104,7 @@ def test_the_weights_belong_to_the_runs_identity_and_their_name_does_not(with_ol
 def test_scores_with_and_without_success_are_of_different_runs(with_old):
     alone, some, more = (identity_of(TrainSettings(closed_loop=n), Demos()) for n in (0, 1, 2))  # type: ignore[arg-type]
     assert some == more != alone
+    assert identity_of(TrainSettings(undisturbed=True), Demos()) != alone  # type: ignore[arg-type]
     smaller = identity_of(TrainSettings(stored="int8"), Demos())  # type: ignore[arg-type]
     assert smaller != alone  # a finished training is not said to be done in a format that was never written
 
@@ -125,7 +126,9 @@ def test_what_cannot_be_trained_is_refused(with_old, overrides, says):
         trained(with_old, *overrides)
 
 
-@pytest.mark.parametrize("setting", ["init=old", "colour=0.3", "places=path", "balance=0.5", "closed_loop=2"])
+@pytest.mark.parametrize(
+    "setting", ["init=old", "colour=0.3", "places=path", "balance=0.5", "closed_loop=2", "undisturbed=true"]
+)
 def test_settings_of_targets_are_refused_for_a_drafter(tmp_path, setting):
     with pytest.raises(UsageError, match=rf"train\.{setting}"):
         plan_drafter(compose("train_drafter", [f"train.{setting}"], TrainDrafterSettings), Database(tmp_path)).make()

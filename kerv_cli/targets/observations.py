@@ -88,6 +88,7 @@ def undisturbed(episode: DemoEpisode, steps: np.ndarray, chunk: int) -> np.ndarr
 
     Noise in the execution changes the later labels of a chunk, so no policy can predict them.
     """
+    check_tail(episode, chunk, f"chunks of {chunk}")
     noisy = np.zeros(len(episode.labels), dtype=bool)  # after an episode's end the expert acts
     noisy[: episode.steps] = (episode.executed != episode.labels[: episode.steps]).any(1)
     return np.asarray(~noisy[steps[:, None] + np.arange(chunk)].any(1))

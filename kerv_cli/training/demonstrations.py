@@ -253,6 +253,8 @@ def recording_of(settings: DemosSettings) -> tuple[DemoConfig, PolicyActs | None
     actor = None
     if settings.policy.kind != EXPERT:
         actor = PolicyActs.of(settings, spec_of(tasks[0]))
+        if settings.quiet:
+            raise UsageError(f"quiet={settings.quiet}: a policy acts, and nothing disturbs it; leave it out")
     elif target != PolicySettings().target:
         raise UsageError(f"policy.target={target}: the expert acts, set policy=vision (or state) too")
     config = DemoConfig(

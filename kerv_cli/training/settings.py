@@ -91,7 +91,7 @@ class TrainSettings:
     scene_steps: int = number(0, 0, 10**9, help="first steps, which train only the vision encoder, on positions")
     held_out: float = number(0.1, above=0, most=0.5, help="share of episodes kept for validation")
     validate_every: int = number(2_000, 1, 10**9, help="steps between two validations")
-    undisturbed: bool = setting(False, "train only on chunks whose actions were all executed without noise")
+    undisturbed: bool = setting(False, "train only on chunks whose actions were all executed as the expert chose them")
     closed_loop: int = number(0, 0, 100_000, help="simulated episodes per task at every validation; 0: none")
     seed: int = number(0, 0, 2**31 - 1, help="seed of the initial weights and of the order of samples")
     bf16: bool = setting(True, "train in bfloat16 on a GPU or a CPU with AMX or AVX512-BF16; else float32")
@@ -220,4 +220,4 @@ def refuse_unused(train: TrainSettings, keys: Sequence[str], why: str) -> None:
     """Refuse optimisation settings that the training would ignore."""
     for key in keys:
         if (value := getattr(train, key)) != getattr(TrainSettings(), key):
-            raise UsageError(f"train.{key}={value}{why}")
+            raise UsageError(f"train.{key}={str(value).lower()}{why}")

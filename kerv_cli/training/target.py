@@ -87,9 +87,9 @@ def plan_target(settings: TrainTargetSettings, database: Database) -> Plan[tuple
         f"{count(train.steps, 'step')} of {train.batch} samples{start}"
     )
 
-    def ready(dataset: DemoDataset, progress: OnProgress) -> fit.Made:
+    def ready(dataset: DemoDataset, progress: OnProgress, undisturbed_only: bool = train.undisturbed) -> fit.Made:
         device, _ = set_up(settings.runtime)
-        target, samples = load_training(settings, dataset, init, world.camera.name, progress)
+        target, samples = load_training(settings, dataset, init, world.camera.name, progress, undisturbed_only)
         seeds = spec.seeds.selection[: train.closed_loop]
         success = functools.partial(success_of, tasks=tasks, seeds=seeds, settings=world) if seeds else None
         imitation = Imitation(target.to(device), samples, train, success)
@@ -103,10 +103,12 @@ def plan_target(settings: TrainTargetSettings, database: Database) -> Plan[tuple
         return target, lambda step: imitation.loss(draw(step), step), imitation.validate, write
 
     def seconds() -> float:
-        # from a few steps on demonstrations of one task, undisturbed ones first
-        chosen = sorted(dataset.of_tasks(tasks[0]), key=lambda index: dataset.episodes[index].perturbed)[: fit.FEW]
-        few = replace(dataset, episodes=[dataset.episodes[index] for index in chosen])
-        target, loss, *_ = ready(few, lambda *done: None)
+        # from a few steps on demonstrations of one task; so few may all be disturbed, so all their chunks count
+        chosen = [dataset.episodes[index] for index in dataset.of_tasks(tasks[0])]
+        if train.undisturbed:
+            chosen.sort(key=lambda episode: episode.perturbed)
+        few = replace(dataset, episodes=chosen[: fit.FEW])
+        target, loss, *_ = ready(few, lambda *done: None, undisturbed_only=False)
         return fit.seconds_of(loss, train, next(target.parameters()).device)
 
     def work(stage: Stage) -> tuple[Path, fit.Metrics]:
@@ -166,7 +168,12 @@ def initial_target(settings: TrainTargetSettings, camera: str, new: Path) -> Pat
 
 
 def load_training(
-    settings: TrainTargetSettings, dataset: DemoDataset, init: Path | None, camera: str, progress: OnProgress
+    settings: TrainTargetSettings,
+    dataset: DemoDataset,
+    init: Path | None,
+    camera: str,
+    progress: OnProgress,
+    undisturbed_only: bool,
 ) -> tuple[CompactTarget, Samples]:
     """Read the demonstrations into memory, and make the network, with the weights in `init` if that is not None."""
     manifest, shapes, old = dataset.manifest, settings.target, None
@@ -178,13 +185,8 @@ def load_training(
     elif not observation.places:
         observation = observation.without_state(WAYPOINTS)
     waypoints = len(observation.places) if settings.train.places == "path" else 0
-    tasks, undisturbed_only = resolve_tasks(settings.task), settings.train.undisturbed
+    tasks = resolve_tasks(settings.task)
     samples = load_samples(dataset, shapes, words, tasks, progress, waypoints, undisturbed_only)
-    if not len(samples):
-        raise CheckpointError(
-            f"every chunk in {dataset.path} was disturbed: record with quiet={2 * shapes.chunk}, "
-            "or leave train.undisturbed out"
-        )
     torch.manual_seed(settings.train.seed)
     if old is None:
         actions = manifest.actions.fitted(samples.chunks[:, 0].numpy().astype(np.float64))
@@ -223,8 +225,7 @@ def load_samples(
     waypoints: int = 0,
     undisturbed_only: bool = False,
 ) -> Samples:
-    chosen = dataset.of_tasks(*task_names)
-    parts = []
+    chosen, parts = dataset.of_tasks(*task_names), list[Samples]()
     for number, index in enumerate(chosen):
         episode = dataset.load(index)
         observations = read_observations(episode, settings, dataset.manifest.observation, words)
@@ -236,16 +237,24 @@ def load_samples(
             learnt = waypoints_of(episode, steps, waypoints, dataset.manifest.actions)
         else:
             learnt = places_of(observations.states, dataset.manifest.observation)
-        parts.append(
-            Samples(
-                **vars(observations),
-                chunks=torch.from_numpy(read_chunks(episode, steps, settings.chunk)).float(),
-                places=learnt,
-                episodes=torch.full((count,), number),
-                tasks=torch.full((count,), task_names.index(episode.task)),
+        if count:
+            parts.append(
+                Samples(
+                    **vars(observations),
+                    chunks=torch.from_numpy(read_chunks(episode, steps, settings.chunk)).float(),
+                    places=learnt,
+                    episodes=torch.full((count,), len(parts)),
+                    tasks=torch.full((count,), task_names.index(episode.task)),
+                )
             )
-        )
         progress(number + 1, len(chosen))
+    learnt_tasks = {int(part.tasks[0]) for part in parts}
+    for number, task in enumerate(task_names):
+        if number not in learnt_tasks:
+            raise CheckpointError(
+                f"every chunk of {task} was disturbed: record it with quiet={2 * settings.chunk}, or leave "
+                "train.undisturbed out"
+            )
     return Samples.joined(parts)
 
 

@@ -197,7 +197,13 @@ def check_recording(config: DemoConfig, out: Path) -> dict[str, Any]:
     def flat(one: dict[str, Any]) -> dict[str, Any]:
         # Another Python or numpy may resume a recording. Another simulator version may have other physics.
         versions = one.get("versions", {})
-        return {**one, **one.get("config", {}), **{name: versions.get(name) for name in packages}, "versions": {}}
+        return {
+            "quiet": 0,
+            **one,
+            **one.get("config", {}),
+            **{name: versions.get(name) for name in packages},
+            "versions": {},
+        }
 
     identity, packages, path = _identity(config), config.spec.packages, out / "recording.json"
     new, old = flat(identity), flat(read_mapping(path) if path.exists() else identity)
