@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 SCALE = 10.0  # factor by which the cosine coefficients are multiplied before they are rounded (FAST §4.3)
-# Number of tokens of a learnt code, the end token included. FAST has 1,024, for longer chunks with more DoFs.
-VOCABULARY = 256
+VOCABULARY = 1024  # number of tokens of a learnt code, the end token included, as in FAST
 # Unicode code point of the character for token 0. To learn or apply merges, each coefficient becomes a character.
 FIRST = 0x4E00
 
