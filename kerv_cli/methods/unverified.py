@@ -12,8 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from kerv_cli.base.limits import number
 from kerv_cli.base.registry import NoSettings, SkipPart
 from kerv_cli.engine.decisions import ROOT, SkipDecision
@@ -138,6 +136,8 @@ def distance(tokens: Sequence[int], others: Sequence[int], space: ActionSpace) -
 
     The result is infinite if the chunks differ in a strict DoF, such as a gripper.
     """
+    import numpy as np
+
     first, second = np.array(tokens), np.array(others)
     if (first != second)[space.strict_tokens(len(first))].any():
         return math.inf

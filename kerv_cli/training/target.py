@@ -250,7 +250,7 @@ def load_samples(
         progress(number + 1, len(chosen))
     learnt_tasks = {int(part.tasks[0]) for part in parts}
     for number, task in enumerate(task_names):
-        if number not in learnt_tasks:
+        if undisturbed_only and number not in learnt_tasks:
             raise CheckpointError(
                 f"every chunk of {task} was disturbed: record it with quiet={2 * settings.chunk}, or leave "
                 "train.undisturbed out"
